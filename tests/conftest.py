@@ -32,7 +32,6 @@ settings.load_profile("side by side")
 ROOT = Path(__file__).parents[1]
 
 BEGUN_FIRST = (
-    "emulated/test_driver.py",
     "emulated/test_timing.py",
     "stability/test_models.py",
     "models/training/reports/test_error_vs_time.py",

@@ -103,22 +103,22 @@ class Board:
 
     # ---- power and cable ----
 
-    def power(self, image: Path, counts: Path | None = None) -> Self:
+    def power(self, image: Path) -> Self:
         """Power comes, with an image in the flash; the port is opened as soon as it is there."""
-        self.do("power", file=str(image), counts=None if counts is None else str(counts))
+        self.do("power", file=str(image))
         self.do("open")
         self.run(BOOT_MS)
         return self
 
     def cut(self, what: str) -> None:
-        """Do `unplug`, `detach` or `stick`, after which one frame may be torn."""
+        """Do `close`, `detach` or `stick`, after which one frame may be torn."""
         self._torn = True
         self.do(what)
 
     # ---- the line ----
 
-    def run_until(self, t_ns: float, *, hand_over: bool = False) -> bytes:
-        """Let time pass and give the bytes that the host got; `hand_over`: no further than that."""
+    def run_until(self, t_ns: float, *, hand_over: bool = False) -> None:
+        """Let time pass; `hand_over`: no further than until the host gets bytes."""
         packets = self.do("run", until=t_ns, hand_over=hand_over)["packets"]
         for at_ns, packet in packets:
             *whole, self._held = (self._held + bytes.fromhex(packet)).split(b"\0")
@@ -129,10 +129,9 @@ class Board:
                     continue
                 assert found is not None, encoded.hex()
                 self.frames.append(Frame(at_ns, *found))
-        return b"".join(bytes.fromhex(packet) for _, packet in packets)
 
-    def run(self, ms: float) -> bytes:
-        return self.run_until(self.now_ns + ms * MS)
+    def run(self, ms: float) -> None:
+        self.run_until(self.now_ns + ms * MS)
 
     def send(self, *data: bytes) -> None:
         self.do("send", bytes=b"".join(data).hex())

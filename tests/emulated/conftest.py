@@ -7,12 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.drivers.spi.conftest import bridge_folder, bridge_program, start_bridge
 from tests.emulated.board import Board
 from tests.emulated.build import image as build_image
 from tests.emulated.build import missing
-
-__all__ = ["bridge_folder", "bridge_program", "start_bridge"]
 
 Image = Callable[..., Path]
 """`tests.emulated.build.image`"""

@@ -1,4 +1,4 @@
-"""The firmware on an emulated chip: its images, its bytes against those of a PC, its light."""
+"""The firmware on an emulated chip: its light, and hosts and sensors that misbehave."""
 
 from __future__ import annotations
 
@@ -6,34 +6,9 @@ from itertools import groupby
 
 import pytest
 
-from tests.drivers.spi.bridge_c import START, STOP, SWEEP, StartBridge, frame
-from tests.emulated.board import BOARD_ID, Board
+from tests.drivers.spi.bridge_c import HELLO, STOP, SWEEP, counts_of, frame, pattern, seq_of
+from tests.emulated.board import BOOT_MS, Board, serials
 from tests.emulated.conftest import Image
-
-SWEEPS = 300
-AT_ONCE = 50
-"""Sweeps of the PC, whose time is real, that may take as long as its patience."""
-
-
-def without_ticks(hello: bytes, sweeps: list[bytes]) -> tuple[bytes, list[bytes]]:
-    """HELLO without its tick, SWEEPs without their start and end."""
-    return hello[:9] + hello[17:], [sweep[:4] + sweep[20:] for sweep in sweeps]
-
-
-def test_hello_and_300_sweeps_are_those_of_the_pc(
-    image: Image, board: Board, start_bridge: StartBridge
-) -> None:
-    host = start_bridge("--board", BOARD_ID)
-    on_the_pc = host.hello()
-    host.send(frame(START))
-    swept = [one for _ in range(SWEEPS // AT_ONCE) for one in host.next_of(SWEEP, AT_ONCE)]
-    expected = without_ticks(on_the_pc, swept)
-    board.power(image())
-    hello = board.hello()
-    board.start()
-    sweeps = board.until(SWEEP, SWEEPS, 10.0 * SWEEPS + 20.0)
-    assert without_ticks(hello, sweeps) == expected
-
 
 STEP_MS = 25
 
@@ -70,3 +45,77 @@ def test_the_light_tells_idle_sweeping_and_a_missing_sensor_apart(
     board.send(frame(STOP))
     board.run(100)
     assert blinking(500, turns(board, 2500)), "stopped"
+
+
+def sweep_on(board: Board, count: int) -> list[bytes]:
+    """Wait for this number of SWEEPs more, to the pause between two of them."""
+    board.take(SWEEP)
+    return board.until(SWEEP, count, 10.0 * (count + 2))
+
+
+@pytest.fixture
+def sweeping(image: Image, board: Board) -> Board:
+    """A board that has just said HELLO and START is sent."""
+    board.power(image())
+    assert all(serials(board.hello()))
+    board.start()
+    return board
+
+
+def test_an_unread_port_costs_frames_and_no_sweep(sweeping: Board) -> None:
+    board = sweeping
+    before = board.status()
+    first = seq_of(sweep_on(board, 1)[0])
+    board.do("read", room=0)
+    board.run(900.0)  # between two STATUS, which would be dropped too
+    board.do("read")
+    sweeps = sweep_on(board, 30)
+    after = board.status()
+    seqs = [first, *map(seq_of, sweeps)]
+    lost = seqs[-1] + 1 - first - len(seqs)
+    assert after.tx_dropped - before.tx_dropped == lost
+    assert 60 < lost < 90  # 2 kB wait in the firmware, 0.6 kB in its USB
+    assert seqs == sorted(set(seqs))
+    assert after.overruns == before.overruns
+    for sweep in sweeps:
+        assert (counts_of(sweep) == pattern(seq_of(sweep))).all()
+
+
+@pytest.mark.parametrize(("gone", "back"), [("close", "open"), ("detach", "attach")])
+def test_a_port_that_comes_back_is_greeted_again(sweeping: Board, gone: str, back: str) -> None:
+    board = sweeping
+    sweep_on(board, 3)
+    board.cut(gone)
+    board.frames.clear()
+    board.run(900.0)
+    assert not board.frames
+    board.do(back)
+    board.run(BOOT_MS)
+    board.do("open")
+    assert list(serials(board.hello())) == [b"BTSP%012d" % (at + 1) for at in range(3)]
+    board.start()
+    board.take(SWEEP)
+    for row, sweep in enumerate(sweep_on(board, 10)):
+        assert seq_of(sweep) == row
+        assert (counts_of(sweep) == pattern(row)).all()
+
+
+def test_a_stuck_spi_ends_in_a_watchdog_reset(sweeping: Board) -> None:
+    board = sweeping
+    sweep_on(board, 2)
+    board.run(9.0)  # in the middle of the next
+    resets = board.do("state")["resets"]
+    board.cut("stick")
+    board.run(900.0)
+    assert not board.take(SWEEP)
+    board.run(300.0)
+    state = board.do("state")
+    assert state["resets"] == resets + 1
+    assert state["configured"]
+    (hello,) = board.take(HELLO)
+    assert hello[5:9] == bytes(4)  # that of a reset
+    assert int.from_bytes(hello[9:17], "little") < 100_000  # ticks begin again
+    assert list(serials(hello)) == [b"BTSP%012d" % (at + 1) for at in range(3)]
+    status = board.status()
+    assert (status.sweeps, status.rx_errors, status.spi_errors) == (0, 0, [0, 0, 0])
+    assert not board.take(SWEEP)  # until START

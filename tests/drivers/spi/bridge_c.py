@@ -5,19 +5,14 @@ Frames are computed with `zlib`, `cobs` and `struct` alone, so that they owe not
 
 from __future__ import annotations
 
-import os
 import random
-import select
 import struct
 import subprocess
-import time
 import zlib
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import pytest
 from cobs import cobs
 from numpy.typing import NDArray
 
@@ -123,60 +118,6 @@ def damaged(rng: random.Random) -> bytes:
         case _:
             whole[:] = frame(kind, rng.randbytes(size + rng.choice((-1, 1, 30)) % 40))
     return bytes(whole)
-
-
-@dataclass
-class Host:
-    """The host's side of a running bridge."""
-
-    process: subprocess.Popen[bytes]
-    path: str
-    descriptor: int
-    held: bytes = b""
-
-    def stop(self) -> None:
-        """Hang up and end the bridge. May be called more than once."""
-        if self.descriptor >= 0:
-            os.close(self.descriptor)
-            self.descriptor = -1
-            self.process.terminate()
-            assert self.process.wait(100) == 0
-
-    def send(self, *data: bytes) -> None:
-        os.write(self.descriptor, b"".join(data))
-
-    def frames(self, timeout_s: float = 100.0) -> Iterator[tuple[int, bytes]]:
-        """Frames as they come; the test fails on a damaged one and after `timeout_s`."""
-        end_s = time.monotonic() + timeout_s
-        while (left_s := end_s - time.monotonic()) > 0:
-            *whole, self.held = self.held.split(b"\0")
-            self.held = b"".join(one + b"\0" for one in whole[1:]) + self.held
-            if whole and whole[0]:
-                one = unframe(whole[0])
-                assert one is not None, whole[0].hex()
-                yield one
-            elif not whole and select.select([self.descriptor], [], [], left_s)[0]:
-                came = os.read(self.descriptor, 65536)
-                assert came, "the bridge has ended"
-                self.held += came
-        pytest.fail(f"nothing more came within {timeout_s} s")
-
-    def next_of(self, kind: int, count: int = 1) -> list[bytes]:
-        """The next payloads of a type."""
-        payloads = (payload for found, payload in self.frames() if found == kind)
-        return [next(payloads) for _ in range(count)]
-
-    def hello(self, nonce: int = 99) -> bytes:
-        """Greet the bridge as PROTOCOL.md says."""
-        self.send(b"\0", frame(STOP), frame(PING, struct.pack("<I", nonce)))
-        while True:
-            payload = self.next_of(HELLO)[0]
-            if struct.unpack_from("<I", payload, 5)[0] == nonce:
-                return payload
-
-
-StartBridge = Callable[..., Host]
-"""Starts a bridge with the given options; `stdin` is what it may read."""
 
 
 def words_of(sweep: bytes) -> Counts:

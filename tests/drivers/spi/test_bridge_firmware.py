@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import random
 import re
+import shutil
 import struct
 import subprocess
+import time
 import zlib
 from pathlib import Path
 
 import pytest
 
+from graspd.drivers.base import TactileReading
 from graspd.drivers.biotac import ERROR_WORDS
+from graspd.drivers.spi.driver import SpiBridgeDriver
 from graspd.drivers.spi.messages import FIRMWARE
+from tests.drivers.one_sweep import tactile
 from tests.drivers.spi.bridge_c import (
     BRIDGE,
     DIGEST,
@@ -21,6 +26,7 @@ from tests.drivers.spi.bridge_c import (
     PAC,
     PDC,
     PING,
+    SANITIZERS,
     STATUS,
     SWEEP,
     TAC,
@@ -30,9 +36,35 @@ from tests.drivers.spi.bridge_c import (
     damaged,
     frame,
     judged,
+    pattern,
 )
+from tests.kit.waiting import wait_until
 
 pytestmark = pytest.mark.usefixtures("comes_first")
+
+
+@pytest.fixture(scope="module")
+def bridge_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where programs are built; skips where nothing can be."""
+    if shutil.which("cc") is None:
+        pytest.skip("no C compiler (cc)")
+    folder = tmp_path_factory.mktemp("bridge")
+    (folder / "empty.c").write_text("int main(void) { return 0; }\n")
+    attempt = subprocess.run(
+        ["cc", *SANITIZERS, str(folder / "empty.c"), "-o", str(folder / "empty")],
+        capture_output=True,
+        check=False,
+    )
+    if attempt.returncode != 0:
+        pytest.skip("the C compiler has no address and undefined behaviour sanitizers")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def bridge_probe(bridge_folder: Path) -> Path:
+    """Answers questions about the C implementation."""
+    core = ("src/biotac.c", "src/cobs.c", "src/crc32.c", "src/protocol.c")
+    return build_program(bridge_folder, "probe", "test/probe.c", *core)
 
 
 def test_the_firmware_passes_its_own_tests(bridge_folder: Path) -> None:
@@ -145,3 +177,22 @@ def test_100000_damaged_frames_are_judged_exactly_and_sound_ones_found(
     assert last == f"errors {errors}", seed
     assert [line for line in lines if line in set(nonces)] == nonces, seed
     assert errors > 50_000
+
+
+def test_the_driver_reads_the_firmware_on_a_pc(bridge_folder: Path, tmp_path: Path) -> None:
+    program = build_program(bridge_folder, "graspd-bridge", "src/*.c", "host/*.c")
+    link = tmp_path / "port"
+    readings: list[TactileReading] = []
+    with subprocess.Popen([program, "--link", link], stdout=subprocess.DEVNULL) as bridge:
+        try:
+            wait_until(link.exists)
+            with SpiBridgeDriver(str(link), ("ff", "mf", "th")) as driver:
+                while len(readings) < 50:
+                    time.sleep(0.001)
+                    readings += tactile(driver.read_ready())
+        finally:
+            bridge.terminate()
+    assert bridge.returncode == 0
+    for reading in readings:
+        assert not reading.faults.any()
+        assert (reading.counts == pattern(reading.seq)).all()

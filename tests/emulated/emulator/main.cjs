@@ -72,22 +72,14 @@ function start(before) {
 
 const commands = {
   // Power comes, with this image in the flash; what the sensors feel begins anew.
-  power({ file, counts }) {
+  power({ file }) {
     image = fs.readFileSync(file);
-    sensors.init(counts ?? '');
+    sensors.init('');
     firstCommand = -1;
     sweeps = row = resets = 0;
     start();
   },
-  // The cable that also feeds the board.
-  unplug() {
-    idleNs = now();
-    chip = null;
-  },
-  plug() {
-    start();
-  },
-  // The cable of a board that is fed otherwise.
+  // The cable, of a board that is fed otherwise.
   detach: () => chip.host.detach(),
   attach: () => chip.host.attach(),
   // Run until a time; `hand_over`: only until bytes have come and a millisecond is full.
