@@ -12,17 +12,12 @@ from unittest import mock
 import can
 import pytest
 
-from graspd.drivers.base import TactileReading
 from graspd.drivers.can.driver import CanBridgeDriver
 from graspd.drivers.can.frames import CanCounters, CanFrame, encode_sample
 from graspd.drivers.can.stream import CanStream
 from graspd.drivers.kernel_stamps import SO_TIMESTAMPNS
 from graspd.drivers.twins.can import SAMPLE_ID, CanTwin
-from graspd.drivers.twins.faults import LinkFaults
-from graspd.drivers.twins.grasps.grasps import Counts
 from tests.drivers.can.can_words import pack_frame, samples
-from tests.drivers.one_sweep import tactile
-from tests.kit.clock import Clock
 
 MS = 1_000_000
 CHANNELS = itertools.count()
@@ -131,36 +126,6 @@ class StampingTwin(CanTwin):
         stamped = partial(can.Bus, preserve_timestamps=True)
         with mock.patch("graspd.drivers.can.bus.can.Bus", stamped):
             super().open()
-
-
-class TwinLink:
-    """Driver and twins on one virtual bus and one clock that tests move, sweep by sweep."""
-
-    def __init__(self, sequence: str = "electrodes") -> None:
-        self.clock = Clock()
-        self.where, self.sequence = channel(), sequence
-        self.driver = bridge(self.where, sequence=sequence, clock=self.clock, wall_clock=self.clock)
-        self.readings: list[TactileReading] = []
-
-    def send(self, counts: Sequence[Counts], faults: LinkFaults = LinkFaults()) -> CanTwin:  # noqa: B008
-        """Send sweeps at 100 Hz; the frames of each arrive at once."""
-        twin = StampingTwin(
-            "virtual",
-            self.where,
-            iter(counts),
-            sequence=self.sequence,
-            faults=faults,
-            clock=self.clock,
-        )
-        with twin:
-            for _ in counts:
-                self.clock.now_ns += 10 * MS
-                twin.send_sweep()
-                self.readings += tactile(self.driver.read_ready())
-            twin.flush()
-            self.readings += tactile(self.driver.read_ready())
-        assert twin.unsent == 0
-        return twin
 
 
 def decoder(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import pty
 import socket
@@ -22,7 +21,6 @@ from tests.drivers.can.can_standin import (
     LOOPBACK,
     ScriptedBus,
     SocketBus,
-    message,
     stand_in,
     sweep_of_frames,
 )
@@ -130,13 +128,6 @@ def test_records_that_are_not_frames_are_counted(socket_bus: SocketBus) -> None:
         assert driver.counters.malformed_frames == 4
 
 
-class DownSocket(socket.socket):
-    """A socket of an interface that was taken down."""
-
-    def recvmsg(self, *_: object) -> Any:  # noqa: ANN401
-        raise OSError(errno.ENETDOWN, "Network is down")
-
-
 def test_frames_that_the_kernel_dropped_cut_the_sweep_there(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -205,24 +196,6 @@ def test_real_socketcan_plays_count_for_count() -> None:
     assert len(readings) == len(counts)
     for reading, expected in zip(readings, counts, strict=True):
         assert (reading.counts == expected).all()
-
-
-def test_old_frames_make_no_fresh_reading(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = Clock()
-    bus = ScriptedBus()
-    stand_in(monkeypatch, lambda: bus)
-    driver = CanBridgeDriver("robotell", "x", clock=clock, sequence="electrodes")
-    twin = CanTwin("virtual", "x", iter(sweeps_of(3)), sequence="electrodes")
-    with driver:
-        driver.read_ready()
-        for _ in range(3):
-            sent = twin.next_frames()
-            opened_ns = clock.now_ns
-            clock.now_ns += 800 * MS
-            bus.script = [message(data, identifier) for identifier, data in sent]
-            for reading in driver.read_ready():
-                assert reading.t_ns == opened_ns
-        assert driver.counters.readings == 0
 
 
 def test_an_adapters_own_words_hide_no_frames_behind_them(

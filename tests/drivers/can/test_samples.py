@@ -147,28 +147,6 @@ def test_an_unknown_period_is_the_fastest_boards(place: int, after_ns: int, is_n
     assert len(readings) == is_next
 
 
-def test_a_period_is_learned_from_two_ends_in_succession() -> None:
-    """Every second sweep has no end, and its lost samples are too few to look like a pause."""
-    sweeps, _ = assembler()
-    stream = [samples(n) if n < 8 or n % 2 else samples(n)[:10] for n in range(50)]
-    feed(sweeps, concatenated(stream))
-    assert sweeps.period_ns == 24 * SLOT_NS
-
-
-def test_a_period_is_learned_though_each_sweep_has_losses() -> None:
-    sweeps, _ = assembler()
-    feed(sweeps, concatenated([samples(n)[:5] + samples(n)[6:] for n in range(6)]))
-    assert sweeps.period_ns == 24 * SLOT_NS
-
-
-def test_the_first_sweep_may_end_on_time_after_a_loss() -> None:
-    sweeps, counters = assembler()
-    kept = samples(0)[:2] + samples(0)[21:]
-    (reading,) = feed(sweeps, retimed(kept, [at * 100_000 for at in (0, 1, 21, 22, 23)]))
-    assert number_in(reading) == 0
-    assert (counters.late_frames, counters.lost_frames) == (0, 19)
-
-
 def test_samples_of_vague_time_make_no_reading() -> None:
     sweeps, counters = assembler()
     readings = feed(sweeps, concatenated([samples(n) for n in range(8)]) + samples(8)[:12])
@@ -182,16 +160,6 @@ def test_samples_of_vague_time_make_no_reading() -> None:
     assert [int(np.count_nonzero(r.faults[0])) for r in readings[8:]] == [12, 12, 0]
     assert counters.untimed_frames == len(stalled)
     assert [reading.seq for reading in readings] == [*range(9), 10, 11]
-
-
-def test_the_period_is_learned_from_samples_whose_time_is_vague() -> None:
-    sweeps, counters = assembler()
-    for n in range(20):
-        for channel, words, t_ns in samples(n):
-            sweeps.push(channel, words, t_ns - 3 * MS, t_ns)
-    assert sweeps.period_ns == 24 * SLOT_NS
-    assert 0 < counters.untimed_frames < 10 * 24
-    assert counters.readings >= 10
 
 
 def retimed(stream: Sequence[Sample], times_ns: Sequence[int]) -> list[Sample]:
@@ -214,17 +182,3 @@ def test_a_host_that_stalls_leaves_no_wrong_period_behind(sequence: str) -> None
         number_in(reading)
     assert sweeps.period_ns == len(SEQUENCES[sequence]) * SLOT_NS
     assert not any(reading.faults.any() for reading in readings[-20:])
-
-
-@pytest.mark.parametrize("sequence", sorted(SEQUENCES))
-@pytest.mark.parametrize("rate_hz", [1, 400])
-def test_slow_and_fast_boards_are_understood(sequence: str, rate_hz: int) -> None:
-    """Nothing is known of the rate when the driver opens."""
-    sweeps, _ = assembler(sequence)
-    slot_ns = round(1e9 / rate_hz / len(SEQUENCES[sequence]))
-    stream = concatenated([samples(n, sequence) for n in range(40)])
-    readings = feed(sweeps, retimed(stream, [slot_ns * at for at in range(len(stream))]))
-    for reading in readings:
-        number_in(reading)
-    assert [r.faults.any() for r in readings[-30:]] == [False] * 30
-    assert sweeps.period_ns == slot_ns * len(SEQUENCES[sequence])

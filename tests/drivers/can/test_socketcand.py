@@ -13,7 +13,7 @@ from graspd.drivers.base import TactileReading
 from graspd.drivers.can.driver import CanBridgeDriver
 from graspd.drivers.link import LinkState
 from graspd.drivers.twins.can import SAMPLE_ID
-from tests.drivers.can.can_standin import ScriptedBus, stand_in, sweep_messages, sweep_of_frames
+from tests.drivers.can.can_standin import sweep_of_frames
 from tests.drivers.one_sweep import counts_of, tactile
 from tests.kit.clock import Clock
 from tests.ports import free_port
@@ -89,24 +89,6 @@ def test_a_server_is_read_and_connected_to_again() -> None:
             assert (next_reading(driver).counts == counts_of(1)).all()
             assert driver.counters.bus_faults == 1
         thread.join()
-
-
-def test_a_board_may_pause_between_sweeps(monkeypatch: pytest.MonkeyPatch) -> None:
-    bus, clock = ScriptedBus(), Clock()
-    stand_in(monkeypatch, lambda: bus)
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        driver = driver_of(listener.getsockname()[1], clock)
-        with driver:
-            for sweep in range(9):
-                for number, sent in enumerate(sweep_messages(sweep)):
-                    sent.timestamp = 5.0 + sweep / 100 + number / 5000
-                    bus.script.append(sent)
-                (reading,) = tactile(driver.read_ready())
-                assert (reading.counts == counts_of(sweep)).all()
-                assert not reading.faults.any()
-                clock.now_ns += 10_000_000
-            assert driver.period_ns == pytest.approx(10_000_000, abs=50_000)
-            assert driver.counters.untimed_frames == 0
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")

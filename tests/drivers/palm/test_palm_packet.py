@@ -137,20 +137,6 @@ def test_every_field_is_read_from_its_place(palm: Palm, appended: bytes) -> None
     )
 
 
-@pytest.mark.parametrize("length", [0, 219, 233, 543])
-def test_a_length_that_no_palm_sends_is_counted_and_dropped(length: int) -> None:
-    counters = PalmCounters()
-    assert parse_packet(b"\x01" + bytes(max(length - 1, 0)), counters) is None
-    assert (counters.bad_lengths, counters.packets) == (1, 0)
-
-
-@pytest.mark.parametrize("length", [220, 416, 542])
-def test_an_empty_packet_is_counted_and_dropped(length: int) -> None:
-    counters = PalmCounters()
-    assert parse_packet(bytes(length), counters) is None
-    assert (counters.empty_packets, counters.packets) == (1, 0)
-
-
 @pytest.mark.parametrize(
     ("offset", "value", "counter"),
     [
@@ -176,22 +162,17 @@ def test_a_field_that_no_palm_sends_is_counted_and_dropped(
 
 
 @pytest.mark.parametrize(
-    ("tactile_type", "names"),
+    ("data", "counter"),
     [
-        (0x0001, ("PDC", "TAC")),
-        (0x0003, ("TDC", "E1")),
-        (0x0005, ("E2", "E3")),
-        (0x0007, ("E4", "E5")),
-        (0x0019, ("E22", "E23")),
-        (0x001B, ("E24", None)),
+        *((b"\x01" * length, "bad_lengths") for length in (219, 233, 543)),
+        (b"", "bad_lengths"),
+        *((bytes(length), "empty_packets") for length in (220, 416, 542)),
     ],
 )
-def test_a_type_stands_for_its_two_channels(
-    tactile_type: int, names: tuple[str, str | None]
-) -> None:
-    position = position_of(tactile_type)
-    assert position is not None
-    assert tuple(channel and channel.name for channel in CHANNELS[position]) == names
+def test_what_no_palm_sends_is_counted_and_dropped(data: bytes, counter: str) -> None:
+    counters = PalmCounters()
+    assert parse_packet(data, counters) is None
+    assert (getattr(counters, counter), counters.packets) == (1, 0)
 
 
 def test_a_round_has_fourteen_types_and_every_electrode_once() -> None:

@@ -203,14 +203,6 @@ def test_a_packet_is_late_within_half_its_steps_time(step: int, after_ns: int, l
     assert sweeps.counters.conflicting_packets == late, "its place is taken already"
 
 
-def test_a_packet_of_the_round_before_is_late() -> None:
-    stream = packets(2)
-    lost = stream.pop(ROUND - 1)
-    played = play_packets([*stream[:ROUND], lost, *stream[ROUND:]])
-    assert [bool(reading.faults.any()) for reading in played.readings] == [True, False]
-    assert (played.counters.late_packets, played.counters.lost_packets) == (1, 1)
-
-
 @pytest.mark.parametrize(("copies", "batch"), [(2, 1), (1, 4)])
 def test_a_palm_whose_words_stand_still_is_read(copies: int, batch: int) -> None:
     """Each round of such a palm equals the one before, and is not its copy."""
@@ -245,14 +237,6 @@ def test_an_equal_packet_within_half_its_time_is_a_copy(
         stream.receive(packet.to_bytes(), cycle * MS)
     stream.receive(steady[position].to_bytes(), 13 * MS + after_ns)
     assert stream.counters.duplicate_packets == is_copy
-
-
-def test_a_palm_that_stands_still_may_lose_packets() -> None:
-    steady: list[PalmPacket | None] = [*packets(1) * 10]
-    lost = {ROUND - 1, *range(4 * ROUND - 2, 4 * ROUND + 3), 5 * ROUND + 3}
-    played = play_packets([None if at in lost else packet for at, packet in enumerate(steady)])
-    assert (played.counters.lost_packets, played.counters.duplicate_packets) == (len(lost), 0)
-    assert len(played.sound()) == 10 - len({at // ROUND for at in lost})
 
 
 def test_a_late_copy_in_its_round_begins_no_round() -> None:

@@ -237,15 +237,6 @@ def test_another_definition_of_the_message_is_named(
         fingers_of(tmp_path / "hand.bag")
 
 
-def test_a_finger_without_electrodes_has_no_sensor(tmp_path: Path) -> None:
-    sweeps = noise(30)
-    for sweep in sweeps:
-        sweep.electrodes["lf"] = ABSENT[:0]
-    path = BagOf(1).write(tmp_path / "hand.bag", sweeps)
-    assert fingers_of(path) == ("ff", "mf", "th")
-    assert len(readings_of(path)) == 30
-
-
 def test_the_joints_of_the_other_hand_are_left_out(tmp_path: Path) -> None:
     path = BagOf(1).write(tmp_path / "hand.bag", sweeps_of(demo()[:30], prefix="lh_"))
     assert "FFJ3" not in read_recording(path)
@@ -262,16 +253,6 @@ def test_a_joint_of_both_hands_has_no_angle(tmp_path: Path) -> None:
     frame = read_recording(path)
     assert frame["FFJ3"].isna().all()
     assert (frame["THJ5"] == 0.7).all()
-
-
-def test_another_message_on_the_topic_is_left_out(tmp_path: Path) -> None:
-    bag = BagOf(1)
-    with rosbag1.Writer(tmp_path / "hand.bag") as writer:
-        for kind, message in ((TACTILE, bag.tactile(noise(1)[0])), ("std_msgs/msg/String", None)):
-            where = writer.add_connection("/rh/tactile", kind, typestore=bag.store)
-            content = b"" if message is None else bag.store.serialize_ros1(message, kind)
-            writer.write(where, START_NS, content)
-    assert len(readings_of(tmp_path / "hand.bag")) == 1
 
 
 def test_bags_of_two_hands_are_not_one_run(tmp_path: Path) -> None:

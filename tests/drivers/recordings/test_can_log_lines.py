@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import io
-
-import can
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -28,18 +25,6 @@ def frames(draw: st.DrawFn) -> CanFrame:
 def test_a_frame_comes_back_from_its_line_to_the_microsecond(frame: CanFrame, wall_ns: int) -> None:
     line = line_of(frame, wall_ns, "can0")
     assert parse(line) == Logged(wall_ns // 1000 * 1000, "can0", frame)
-
-
-@given(frames())
-def test_python_can_reads_our_lines(frame: CanFrame) -> None:
-    if frame.flags & ERROR:
-        return  # python-can keeps no class of an error
-    (message,) = can.CanutilsLogReader(io.StringIO(line_of(frame, 10**18, "can0")))
-    assert message.arbitration_id == frame.arbitration_id
-    assert bytes(message.data or b"") == frame.data
-    assert message.is_extended_id == bool(frame.flags & EXTENDED)
-    assert message.is_remote_frame == bool(frame.flags & REMOTE)
-    assert message.timestamp == pytest.approx(1e9)
 
 
 BUS_WARNING = CanFrame(4, b"\0\1" + 6 * b"\0", ERROR)

@@ -13,9 +13,8 @@ import pytest
 from graspd.drivers.base import RecordingError, TactileReading
 from graspd.drivers.biotac import sample_command
 from graspd.drivers.can.frames import CanFrame
-from graspd.drivers.recordings.can_log import CanLog, Survey, line_of, read_log
+from graspd.drivers.recordings.can_log import CanLog, Survey, line_of
 from tests.drivers.one_sweep import tactile
-from tests.kit.clock import Clock
 
 SAMPLE_ID = 0x5A1
 MF_FF_TH = [[2602], [2713], [2391]]
@@ -241,27 +240,3 @@ def test_a_clock_that_was_set_back_is_a_pause(tmp_path: Path) -> None:
     times_ns = [reading.made_ns for reading in readings]
     assert times_ns == sorted(times_ns)
     assert len([reading for reading in readings if not reading.faults.any()]) == 5
-
-
-def test_a_link_log_plays_at_its_own_pace_times_speed(tmp_path: Path) -> None:
-    path, clock = tmp_path / "can.log", Clock()
-    path.write_text("".join(lines_of(7)))
-    fingers = ("ff", "mf", "th")
-    with CanLog([path], fingers, sequence="electrodes", speed=2.0, clock=clock) as driver:
-        assert driver.period_ns is None
-        began_ns, times_us = clock.now_ns, []
-        while not driver.exhausted:
-            clock.now_ns = driver.due_ns() or clock.now_ns
-            times_us += [(r.t_ns - began_ns) // 1000 for r in driver.read_ready()]
-        assert driver.period_ns == 24 * 200_000
-    assert times_us == [(24 * sweep + 23) * 200 for sweep in range(7)]
-    with CanLog([path], fingers, sequence="electrodes", clock=clock) as driver:
-        assert len([reading for _ in range(7) for reading in driver.read_ready()]) == 7
-        assert driver.period_ns == 24 * STEP_NS
-
-
-def test_a_file_of_another_kind_is_not_a_can_log(tmp_path: Path) -> None:
-    path = tmp_path / "table.log"
-    path.write_text("a,b\n1,2\n")
-    with pytest.raises(RecordingError, match="is a text table, not a CAN log"):
-        list(read_log(path))

@@ -121,12 +121,6 @@ def test_a_loop_starts_again_and_time_continues(tmp_path: Path) -> None:
     assert begins == [2, 6], "a stream does not follow what was before"
 
 
-def test_a_schedule_does_not_drift_by_rounding(tmp_path: Path) -> None:
-    clock = Clock(0)
-    driver = ReplayDriver([write(tmp_path, table(301))], rate_hz=300, clock=clock)
-    assert play(driver, clock)[300].t_ns == 1_000_000_000
-
-
 def test_a_stream_with_joints_gives_the_joints_before_the_counts(tmp_path: Path) -> None:
     angles = {"rh_THJ5": ["0.1", "0.2"], "rh_FFJ0": ["1.5", "nan"]}
     path = write(tmp_path, stream(["0", "0.01"], angles))
@@ -202,18 +196,3 @@ def test_bad_values_are_counted_and_strict_refuses_them(tmp_path: Path) -> None:
     assert (counters.not_counts, counters.cut_off) == (3, 1)
     with pytest.raises(RecordingError, match=r"line 3, column ff_biotac_1: 'nan' is not a count"):
         play(ReplayDriver([path], speed=None, strict=True))
-
-
-def test_opening_again_starts_over(tmp_path: Path) -> None:
-    driver = ReplayDriver([write(tmp_path, table(3))], speed=None)
-    first, second = play(driver), play(driver)
-    assert [reading.seq for reading in second] == [reading.seq for reading in first] == [0, 1, 2]
-    assert driver.counters.readings == 3
-    driver.open()
-    driver.read_ready()
-    driver.open()
-    assert len(driver.read_ready()) == 1
-    driver.close()
-    assert driver.due_ns() is None
-    with pytest.raises(RuntimeError, match="not open"):
-        driver.read_ready()

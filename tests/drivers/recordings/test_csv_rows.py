@@ -57,21 +57,6 @@ def test_columns_stand_in_any_order() -> None:
     assert row.annotation.object_name is None
 
 
-def test_only_unknown_columns_are_listed() -> None:
-    header = [*TABLE_HEADER, "force", "", "s", "force", "FFJ3"]
-    content = ",".join(header).encode() + b"\n" + b"0," * 78 + b"0\n"
-    found = survey(PATH, io.BytesIO(content), ("mf",))
-    assert found.columns.ignored == ("force", "", "s", "force")
-
-
-@pytest.mark.parametrize(
-    ("cell", "name"), [('"a ""red"" pen, long"', 'a "red" pen, long'), ("  ", None)]
-)
-def test_an_object_name_may_be_quoted_or_blank(cell: str, name: str | None) -> None:
-    (row,) = rows_of(table(1, {0: {"object": cell}}))
-    assert row.annotation.object_name == name
-
-
 GOOD = table(2)
 BAD_FILES = {
     "empty": (b"", "grasps.csv: the file is empty"),
@@ -151,12 +136,6 @@ def test_a_time_is_a_number_or_a_clock(t: str) -> None:
         rows_of(stream([t, "1"]))
 
 
-@pytest.mark.parametrize("t", ["-3.5", "1700000000.123456"])
-def test_a_time_may_have_any_offset(t: str) -> None:
-    first, second = rows_of(stream([t, t]))
-    assert first.t_s == second.t_s == float(t)
-
-
 def test_a_line_of_exactly_the_limit_is_read() -> None:
     room = LINE_LENGTH_MAX - len(line(TABLE_HEADER, cells(0, {"object": ""}))) - 1
     assert len(rows_of(table(1, {0: {"object": "x" * room}}))) == 1
@@ -170,15 +149,6 @@ def test_a_last_row_without_line_end_is_cut_off() -> None:
     assert (last.faults == ElectrodeFault.CUT_OFF).all()
     with pytest.raises(RecordingError, match=r"line 4: the last row has no line end; .* cut off"):
         rows_of(table(3).rstrip(b"\n"), strict=True)
-
-
-def test_a_value_can_be_wrong_and_cut_off() -> None:
-    *_, last = rows_of(table(1, {0: {"th_biotac_24": "26x"}}).rstrip(b"\n"))
-    both = ElectrodeFault.CUT_OFF | ElectrodeFault.NOT_A_COUNT
-    (row,) = rows_of(stream(["0"], {"FFJ1": ["0.5"]}).rstrip(b"\n"))
-    assert np.isnan(row.position_rad).all()
-    assert last.faults[2, 23] == both
-    assert (last.faults.ravel()[:-1] == ElectrodeFault.CUT_OFF).all()
 
 
 @pytest.mark.parametrize(
@@ -262,12 +232,6 @@ def test_an_integer_may_be_written_in_several_ways(cell: str, expected: int) -> 
     (row,) = rows_of(table(1, {0: {"th_biotac_24": cell}}), strict=True)
     assert row.counts[2, 23] == expected
     assert not row.faults.any()
-
-
-@pytest.mark.parametrize(("cell", "told"), [("x" * 40, "x" * 40), ("x" * 41, "x" * 40 + "...")])
-def test_a_message_shows_forty_characters_of_a_cell(cell: str, told: str) -> None:
-    with pytest.raises(RecordingError, match=rf"column th_biotac_24: '{re.escape(told)}' is not"):
-        rows_of(table(1, {0: {"th_biotac_24": cell}}), strict=True)
 
 
 @given(st.text(max_size=12) | st.from_regex(r"[0-9.eE+_ -]{1,8}", fullmatch=True))

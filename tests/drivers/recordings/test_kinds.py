@@ -142,15 +142,6 @@ def lines(path: Path) -> bytes:
         return file.read()
 
 
-def test_a_packed_file_reads_as_unpacked_and_rewinds(tmp_path: Path) -> None:
-    path = write(tmp_path, gzip.compress(table(50)))
-    assert lines(path) == table(50)
-    with open_recording(path) as file:
-        first = file.read(1000)
-        file.seek(0)
-        assert file.read(1000) == first == table(50)[:1000]
-
-
 @pytest.mark.parametrize("damage", [lambda data: data[:-20], lambda data: data[:99] + b"?" * 99])
 def test_a_damaged_packed_file_is_an_error(
     tmp_path: Path, damage: Callable[[bytes], bytes]

@@ -220,18 +220,6 @@ def layout(content: bytes, folder: Path, read_as: ReadAs | None = None) -> bool:
     return layout_of(write(folder, content), FINGERS, read_as, rate_hz).is_stream
 
 
-@pytest.mark.parametrize(("scale", "unit"), [(1e3, 1e-3), (1e6, 1e-6), (1e9, 1e-9)])
-def test_the_unit_of_times_is_known_by_their_steps(
-    tmp_path: Path, scale: float, unit: float
-) -> None:
-    names, cells = sweeps()
-    place = names.index("t")
-    cells[:, place] = [f"{float(value) * scale:.0f}" for value in cells[:, place]]
-    found = layout_of(write(tmp_path, written(names, cells)), FINGERS)
-    assert found.is_stream
-    assert found.unit_s == unit
-
-
 def test_grasps_with_times_a_minute_apart_are_doubted(tmp_path: Path) -> None:
     header, *lines = DEMO_TABLE.read_text().splitlines()
     content = "\n".join(["time," + header, *(f"{60 * n},{line}" for n, line in enumerate(lines))])
@@ -299,50 +287,6 @@ def test_few_slow_sweeps_are_never_a_table(
     names[names.index("t")] = "number"
     with pytest.raises(RecordingError, match=rf"{said}: sweeps of a stream .*--as table"):
         layout(written(names, cells[first::25]), tmp_path)
-
-
-def any_value(cells: NDArray[np.str_], random: np.random.Generator) -> None:
-    for place in (5, 30, 60):
-        cells[:, place] = random.integers(0, 4096, len(cells))
-
-
-def missing(cells: NDArray[np.str_], random: np.random.Generator) -> None:
-    cells[random.random(cells.shape) < 0.05] = ""
-
-
-def noisy(cells: NDArray[np.str_], random: np.random.Generator) -> None:
-    values = cells.astype(float) + random.normal(0.0, 8.0, cells.shape)
-    cells[:] = np.clip(values, 0.0, 4095.0).astype(int)
-
-
-@pytest.mark.parametrize("number", [5, 260])
-@pytest.mark.parametrize("damage", [any_value, missing, noisy])
-def test_sweeps_with_broken_electrodes_are_never_a_table(
-    tmp_path: Path, number: int, damage: Callable[..., None]
-) -> None:
-    names, cells = sweeps(number)
-    damage(cells[:, 3:75], np.random.default_rng(3))
-    names[names.index("t")] = "number"
-    content = written(names, cells)
-    with pytest.raises(RecordingError, match=r"sweeps of a stream \(--as stream.*--as table"):
-        layout(content, tmp_path)
-    if number == 5:
-        assert not layout(content, tmp_path, "table")
-        return
-    with pytest.raises(RecordingError, match="change as sweeps of a stream do"):
-        layout(content, tmp_path, "table")
-
-
-def test_several_readings_of_each_grasp_are_a_table_if_told(tmp_path: Path) -> None:
-    header, *lines = DEMO_TABLE.read_text().splitlines()
-    random = np.random.default_rng(2)
-    cells = np.array([line.split(",") for line in lines[:40]]).repeat(6, axis=0)
-    noise = random.normal(0.0, 3.0, (240, 72))
-    cells[:, 2:] = np.round(cells[:, 2:].astype(float) + noise).astype(int).astype(str)
-    content = written(header.split(","), cells)
-    with pytest.raises(RecordingError, match="240 of 240 rows nearly repeat another"):
-        layout(content, tmp_path)
-    assert not layout(content, tmp_path, "table")
 
 
 def test_published_grasps_are_tables(bts3_dir: Path, tmp_path: Path) -> None:

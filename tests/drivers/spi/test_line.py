@@ -146,20 +146,6 @@ def test_why_a_port_cannot_be_opened_is_one_short_line(
         SerialLine("port", 9600).open()
 
 
-def test_a_descriptor_too_high_for_pyserial_is_a_link_error(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    port = Port()
-    line = opened(monkeypatch, port)
-    port.failure = port.refusal = ValueError("filedescriptor out of range in select()")
-    with pytest.raises(LinkError, match="the device went away"):
-        line.read()
-    with pytest.raises(LinkError, match="the device went away"):
-        line.write(b"abc")
-    with pytest.raises(LinkError, match="port: filedescriptor out of range"):
-        line.open()
-
-
 def test_who_taps_a_line_gets_all_that_comes_and_goes(monkeypatch: pytest.MonkeyPatch) -> None:
     tapped: list[tuple[LineEvent, bytes]] = []
     line = opened(monkeypatch, Port(b"in"))

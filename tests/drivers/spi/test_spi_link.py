@@ -49,11 +49,6 @@ def test_the_greeting_is_that_of_the_protocol(rig: Rig) -> None:
     assert rig.driver.conversation.link.state is LinkState.CLOSED
 
 
-def test_first_nonces_follow_the_time(rig: Rig) -> None:
-    rig.clock.now_ns = (7 << 32) + 12345
-    assert rig.greet()[-1] == Ping(12346)
-
-
 REFUSALS = [
     (
         encode_frame(0x01, struct.pack("<BII", 2, 0xCAFEF00D, 0) + b"later things"),
@@ -101,18 +96,6 @@ def test_a_port_that_another_program_has_is_said(rig: Rig) -> None:
     with SpiBridgeDriver(rig.bridge.port, FINGERS) as second:
         assert second.conversation.link.reason == f"{rig.bridge.port}: another program has it open"
     assert rig.driver.conversation.link.state is LinkState.GREETING
-
-
-def test_unplugging_is_noticed_at_once(rig: Rig) -> None:
-    rig.greet()
-    rig.clock.now_ns += 20 * MS
-    rig.bridge.send(sweep(0, 10_000))
-    take(rig.driver, rig.bridge)
-    rig.bridge.unplug()
-    assert rig.driver.read_ready() == ()
-    assert rig.driver.conversation.link.state is LinkState.WAITING
-    assert rig.driver.conversation.link.reason == f"{rig.bridge.port}: the device went away"
-    assert rig.driver.counters.link_losses == 1
 
 
 def test_a_port_without_descriptor_is_polled(rig: Rig) -> None:
