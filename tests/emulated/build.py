@@ -10,14 +10,13 @@ import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
+
+import pytest
 
 from tests.conftest import ROOT, data_dir
 
-Sequence = Literal["electrodes", "all", "interleaved"]
-
 BRIDGE: Final = ROOT / "deploy" / "bridge"
-SOURCES: Final = (BRIDGE / "src", BRIDGE / "pico")
 FOLDER: Final = ROOT / "build" / "pico"
 EMULATOR_FOLDER: Final = ROOT / "build" / "emulated"
 """Everything made here is in these two, which git does not see."""
@@ -39,10 +38,6 @@ class MissingError(Exception):
     """Something that a build needs is not there; says what."""
 
 
-class BuildError(Exception):
-    """The firmware does not compile; says how."""
-
-
 def shared_dir() -> Path | None:
     """Folder of the pico-sdk's subset and of the boot ROM, or None where there is none."""
     data = data_dir()
@@ -52,46 +47,25 @@ def shared_dir() -> Path | None:
     return next(found, None)
 
 
-def image(
-    sensors: int = 3,
-    clock_mhz: int = 125,
-    sequence: Sequence = "electrodes",
-) -> Path:
-    """Build an image, or find the one that was built of the same sources.
+def image(sensors: int = 3, clock_mhz: int = 125, sequence: str = "electrodes") -> Path:
+    """Build an image and return its `.bin`, as it lies in flash from 0x10000000.
 
-    `clock_mhz` is the chip's system clock (125, 133, 200). Gives the `.bin` as it lies in flash
-    from 0x10000000; the `.elf` with symbols is beside it. Raises `MissingError` where a tool or the
-    pico-sdk is missing, `BuildError` where the compiler objects.
+    `clock_mhz` is the chip's system clock (125, 133, 200). Raises `MissingError` where a tool or
+    the pico-sdk is missing.
     """
     check_tools()
     FOLDER.mkdir(parents=True, exist_ok=True)
+    folder = FOLDER / f"{sensors}-{clock_mhz}-{sequence}"
     with _alone(FOLDER / "lock"):
-        sdk = pico_sdk()
-        options = {
-            "PICO_SDK_PATH": str(sdk),
-            "BRIDGE_SENSORS": str(sensors),
-            "BRIDGE_SYS_CLOCK_MHZ": str(clock_mhz),
-            "BRIDGE_SEQUENCE": f"BIOTAC_{sequence.upper()}",
-        }
-        kind = f"{sensors}-{clock_mhz}-{sequence}"
-        made = FOLDER / "images" / f"{kind}-{_digest(sdk, options)}.bin"
-        if not made.is_file():
-            made.parent.mkdir(exist_ok=True)
-            for old in made.parent.glob(f"{kind}-*"):
-                old.unlink()
-            place = hashlib.sha256(f"{ROOT} {sdk}".encode()).hexdigest()[:8]
-            _build(FOLDER / f"{clock_mhz}-{place}", options, made)
-    return made
-
-
-def _build(folder: Path, options: dict[str, str], made: Path) -> None:
-    """Compile one image; what it has in common with the last one in this folder stays there."""
-    settings = [f"-D{name}={value}" for name, value in options.items()]
-    _run("cmake", "-G", "Ninja", "-S", BRIDGE / "pico", "-B", folder, *settings)
-    _run("ninja", "-C", folder, "bridge")
-    shutil.copy(folder / "bridge.elf", made.with_suffix(".elf"))
-    shutil.copy(folder / "bridge.bin", made.with_suffix(".part"))
-    made.with_suffix(".part").rename(made)
+        settings = [
+            f"-DPICO_SDK_PATH={pico_sdk()}",
+            f"-DBRIDGE_SENSORS={sensors}",
+            f"-DBRIDGE_SYS_CLOCK_MHZ={clock_mhz}",
+            f"-DBRIDGE_SEQUENCE=BIOTAC_{sequence.upper()}",
+        ]
+        _run("cmake", "-G", "Ninja", "-S", BRIDGE / "pico", "-B", folder, *settings)
+        _run("ninja", "-C", folder, "bridge")
+    return folder / "bridge.bin"
 
 
 def check_tools() -> None:
@@ -130,17 +104,6 @@ def pico_sdk() -> Path:
     return sdk
 
 
-def _digest(sdk: Path, options: dict[str, str]) -> str:
-    """What an image is made of: sources, version of the SDK, compiler, options."""
-    version = subprocess.run([COMPILER, "--version"], capture_output=True, check=True).stdout
-    digest = hashlib.sha256(version + repr(options).encode())
-    digest.update((sdk / "pico_sdk_version.cmake").read_bytes())
-    for file in sorted(file for folder in SOURCES for file in folder.rglob("*") if file.is_file()):
-        content = hashlib.sha256(file.read_bytes()).hexdigest()
-        digest.update(f"{file.relative_to(ROOT)} {content}\n".encode())
-    return digest.hexdigest()[:16]
-
-
 @contextmanager
 def _alone(path: Path) -> Iterator[None]:
     """Let one process build at a time."""
@@ -153,7 +116,7 @@ def _run(*command: str | Path) -> None:
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         told = (done.stdout + done.stderr).splitlines()[-40:]
-        raise BuildError("\n".join([f"{command[0]}:", *(line[:300] for line in told)]))
+        pytest.fail("\n".join([f"{command[0]}:", *(line[:300] for line in told)]))
 
 
 def missing() -> str | None:

@@ -12,11 +12,11 @@ from graspd.drivers.udp import Datagram
 PERIOD_NS = 10_000_000
 FINGERS = ("ff", "mf", "th")
 COUNTS = list(range(2000, 2024))
-HERE, THERE = ("127.0.0.1", 7), ("127.0.0.1", 8)
+HERE = ("127.0.0.1", 7)
 START_S = 70.0
-ACTIONS = ("send", "lose", "copy", "late", "stall", "stale", "stranger", "short", "left", "rail")
+ACTIONS = ("send", "lose", "copy", "late", "stall", "stale")
 """What becomes of a sweep. `late`: others overtake it; `stall`: those behind it wait as well;
-`stale`: the topic repeats the time of the one before; `short`, `rail`: the middle finger."""
+`stale`: the topic repeats the time of the one before."""
 Plan = list[tuple[str, int]]
 """For each sweep an action, and for how many periods it is held back."""
 
@@ -40,7 +40,7 @@ def arrivals(
 ) -> list[tuple[int, Datagram, int]]:
     """Return reception in ns, datagram and place of its sweep, one sweep every 10 ms.
 
-    `counts`: of a sweep, by finger. A datagram that must give no count has place -1.
+    `counts`: of a sweep, by finger.
     """
     found: list[tuple[int, Datagram, int]] = []
     held_until = 0
@@ -49,19 +49,13 @@ def arrivals(
         now, time_s = max(place, held_until), START_S + place / 100
         if action == "stall":
             now = held_until = max(held_until, place + periods)
-        sender = THERE if action == "stranger" else HERE
-        if action == "short":
-            good["mf"] = good["mf"][:19]
-        elif action == "rail":
-            good["mf"] = [0] * 24
-        elif action == "stale":
+        if action == "stale":
             time_s -= 0.01
         elif action == "late":
             now += periods
-        hand = "left" if action == "left" else "right"
-        datagram = Datagram(message(good, seq=place, t=time_s, hand=hand), 0, sender)
+        datagram = Datagram(message(good, seq=place, t=time_s), 0, HERE)
         if action != "lose":
-            found.append((now, datagram, -1 if action in ("stranger", "left") else place))
+            found.append((now, datagram, place))
         if action == "copy":
             found.append((now + periods, datagram, place))
     found.sort(key=lambda each: each[0])  # those of one time stay in their order

@@ -12,8 +12,6 @@ from hypothesis import strategies as st
 from graspd.drivers.base import ElectrodeFault, Reading, TactileReading
 from graspd.drivers.datagrams.tactile import TactileStream, TactileStreamDriver
 from graspd.drivers.link import SenderClock
-from graspd.drivers.twins.datagrams import TactileTwin
-from graspd.drivers.twins.faults import LinkFaults
 from tests.drivers.datagrams.network import FINGERS, Plan, arrivals, links, message
 from tests.drivers.one_sweep import counts_of, number_in, tactile
 from tests.drivers.palm.palm_stream import DatagramClock, Sender, flags
@@ -244,23 +242,6 @@ def test_gaps_are_losses_and_new_senders_are_other_sensors(
     assert driver.counters.foreign_datagrams == 1
 
 
-def test_a_twin_sends_what_a_driver_reads() -> None:
-    faults = LinkFaults(dead_electrodes=((0, 6),), unplugged_fingers=(1,))
-    sweeps = [counts_of(number) for number in range(3)]
-    sent = [data for cycle in TactileTwin(sweeps, faults=faults).cycles() for data in cycle]
-    readings, counters = received(*sent)
-    assert counters == {"readings": 3, "faulty_readings": 3, "absent_fingers": 3}
-    assert [reading.counts[2].tolist() for reading in readings] == [
-        sweep[2].tolist() for sweep in sweeps
-    ]
-    assert {int(reading.counts[0, 6]) for reading in readings} == {0}
-    with pytest.raises(ValueError, match="wrong-version"):
-        TactileTwin(sweeps, faults=LinkFaults(wrong_version=True))
-    for rate_hz in (0.0, float("nan"), 1000.1):
-        with pytest.raises(ValueError, match="at most 1000"):
-            TactileTwin(sweeps, rate_hz=rate_hz)
-
-
 @settings(max_examples=100, deadline=None)
 @given(links())
 def test_no_count_is_older_than_its_reading_says(plan: Plan) -> None:
@@ -278,13 +259,11 @@ def test_no_count_is_older_than_its_reading_says(plan: Plan) -> None:
             if driver.sender != "udp://127.0.0.1:7":
                 return  # after 0.5 s of silence: other sensors
             for reading in tactile(readings):
-                sound = reading.faults == 0
                 assert number_in(reading) == place
                 assert place > last or driver.counters.as_dict()["restarts"]
                 # The first message came at once; clocks may drift by 0.1 %.
                 sent_ns = start_ns + 10 * MS * place
                 assert reading.t_ns <= sent_ns + received_ns // 1000
-                assert not sound[1].any() or plan[place][0] not in ("short", "rail")
                 last = place
         driver.close()
     assert last >= 0, "the first message is read"

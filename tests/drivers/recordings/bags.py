@@ -85,16 +85,17 @@ class BagOf:
         path: Path,
         sweeps: Iterable[Sweep],
         topic: str = "/rh/tactile",
-        packing: rosbag2.CompressionMode | None = None,
+        packing: rosbag1.Writer.CompressionFormat | rosbag2.CompressionMode | None = None,
         **options: Any,  # noqa: ANN401
     ) -> Path:
-        """Write a bag. `packing` and `options`: of the writer of ROS 2."""
+        """Write a bag. `options`: of the writer of ROS 2."""
         if self.version == 1:
             writer: Any = rosbag1.Writer(path)
         else:
             writer = rosbag2.Writer(path, **{"version": 9, **options})
-            if packing is not None:
-                writer.set_compression(packing, rosbag2.CompressionFormat.ZSTD)
+        if packing is not None:
+            zstd = () if self.version == 1 else (rosbag2.CompressionFormat.ZSTD,)
+            writer.set_compression(packing, *zstd)
         pack = self.store.serialize_ros1 if self.version == 1 else self.store.serialize_cdr
         with writer:
             connections: dict[str, Connection] = {}
