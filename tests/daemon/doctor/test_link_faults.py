@@ -31,8 +31,8 @@ from tests.daemon.doctor.emulated import (
     look,
     refused,
 )
-from tests.drivers.can.can_standin import ScriptedBus, SocketBus, stand_in
-from tests.drivers.can.test_can_socket import DownSocket, over_socket
+from tests.drivers.can.can_standin import DownSocket, ScriptedBus, SocketBus, stand_in
+from tests.drivers.can.test_can_socket import over_socket
 
 LOOK_S = 3
 QUARTER_S, EVERY_S = 900, 20

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
 import socket
 from collections.abc import Callable, Sequence
@@ -52,6 +53,13 @@ class SocketBus:
 
     def shutdown(self) -> None:
         self.socket.close()
+
+
+class DownSocket(socket.socket):
+    """A socket of an interface that was taken down."""
+
+    def recvmsg(self, *_: object) -> Any:  # noqa: ANN401
+        raise OSError(errno.ENETDOWN, "Network is down")
 
 
 class ScriptedBus:
