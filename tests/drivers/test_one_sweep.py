@@ -52,7 +52,6 @@ BASE_ID = 0x100
 SILENT_NS = 110 * MS
 """How long a board says nothing after a reset, as deploy/can/PROTOCOL.md asks."""
 WORDS = [word(count) for count in range(4096)]
-ROUND = 14
 PACKETS = [
     packet.to_bytes() for packet in PalmTwin(counts_of(number) for number in range(600)).packets()
 ]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import tomllib
 from collections.abc import Callable
 
@@ -80,17 +79,3 @@ def test_what_is_read_is_what_tomllib_reads(text: str) -> None:
         assert toml.loads(text) == wanted
     except toml.NestedTooDeeplyError:
         assert sum(map(text.count, ".[{")) >= toml.DEPTH_MAX
-
-
-BYTES = 128 * 1024
-COSTLY = {
-    "eight names": "\n".join(f"[a.b.c.d.e.f.g.h{n}]\na.a.a.a.a.a.a.a=1" for n in range(4000)),
-    "open strings": '"""' + '\\"""' * BYTES,
-    "quotes": 'a = """' + '""a' * BYTES + '"""',
-}
-
-
-@pytest.mark.parametrize("what", COSTLY)
-def test_each_text_is_read_to_an_end_or_refused(what: str) -> None:
-    with contextlib.suppress(ValueError):
-        toml.loads(COSTLY[what][:BYTES])

@@ -20,7 +20,6 @@ from graspd.drivers.kernel_stamps import SO_TIMESTAMPNS
 from graspd.drivers.twins.can import SAMPLE_ID, CanTwin
 from tests.drivers.can.can_words import pack_frame, samples
 
-MS = 1_000_000
 CHANNELS = itertools.count()
 LOOPBACK = "lo"
 """The driver looks for the interface before python-can does; this one is always there."""

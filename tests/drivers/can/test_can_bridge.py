@@ -21,8 +21,6 @@ from tests.drivers.can.can_standin import (
 from tests.drivers.one_sweep import counts_of, tactile
 from tests.kit.clock import Clock
 
-MS = 1_000_000
-
 
 def test_a_package_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("can.interfaces.udp_multicast.utils.msgpack", None)

@@ -30,8 +30,6 @@ from tests.ports import free_port
 
 FRAMES_PER_DRAIN = 512
 POLL_NS = 1_000_000
-SILENCE_NS = 100_000_000
-"""Ten readings at 100 Hz."""
 
 MS = 1_000_000
 

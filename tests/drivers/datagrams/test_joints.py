@@ -55,43 +55,31 @@ def test_the_example_of_the_documentation_is_read() -> None:
     assert not any(counters.as_dict().values())
 
 
-def test_a_hand_prefix_and_other_fields_do_no_harm() -> None:
-    found, counters = parse(
-        '{"v": 3, "joints": {"rh_WRJ1": -3.4906, "lh_LFJ5": 3.4906}, "note": [1, {}]}'
-    )
-    assert found is not None
-    assert found.names == ("WRJ1", "LFJ5")
-    assert found.position_rad.tolist() == [-3.4906, 3.4906], "200 degrees at most"
-    assert not any(counters.as_dict().values())
+IMPOSSIBLE = ["NaN", "1e999", "true", "null", '"0.5"', "3.4908", "-3.4908", "1" + "0" * 400]
 
 
 @pytest.mark.parametrize(
-    "angle",
-    ["NaN", "1e999", "true", "null", '"0.5"', "3.4908", "-3.4908", "1" + "0" * 400],
+    ("joints", "angles", "counted"),
+    [
+        # A hand's prefix does no harm; 200 degrees at most.
+        ('"rh_WRJ1": -3.4906, "lh_LFJ5": 3.4906', {"WRJ1": -3.4906, "LFJ5": 3.4906}, {}),
+        *(
+            (f'"FFJ3": 0.5, "FFJ4": {angle}', {"FFJ3": 0.5, "FFJ4": math.nan}, {"bad_angles": 1})
+            for angle in IMPOSSIBLE
+        ),
+        ('"FFJ3": 0.5, "rh_FFJ3": 0.6', {"FFJ3": math.nan}, {"bad_angles": 1}),
+        ('"ffj3": 0.1, "FFJ3": 0.5', {"FFJ3": 0.5}, {"unknown_names": 1}),
+        ('"elbow": 0.1, "FFJ3": 0.5', {"FFJ3": 0.5}, {"unknown_names": 1}),
+    ],
 )
-def test_an_impossible_angle_is_nan_and_costs_no_other(angle: str) -> None:
-    found, counters = parse('{"joints": {"FFJ3": 0.5, "FFJ4": ' + angle + ', "THJ5": 0}}')
+def test_what_is_no_angle_of_a_joint_costs_no_other(
+    joints: str, angles: dict[str, float], counted: dict[str, int]
+) -> None:
+    found, counters = parse(f'{{"v": 3, "joints": {{{joints}}}, "note": [1, {{}}]}}')
     assert found is not None
-    assert found.names == ("FFJ3", "FFJ4", "THJ5")
-    assert found.position_rad[[0, 2]].tolist() == [0.5, 0.0]
-    assert math.isnan(found.position_rad[1])
-    assert counters.bad_angles == 1
-
-
-@pytest.mark.parametrize("name", ["ffj3", "elbow"])
-def test_an_unknown_name_is_left_out_and_counted(name: str) -> None:
-    found, counters = parse(json.dumps({"joints": {name: 0.1, "FFJ3": 0.5}}))
-    assert found is not None
-    assert found.names == ("FFJ3",)
-    assert counters.unknown_names == 1
-
-
-def test_one_joint_under_two_names_has_no_angle() -> None:
-    found, counters = parse('{"joints": {"FFJ3": 0.5, "rh_FFJ3": 0.6}}')
-    assert found is not None
-    assert found.names == ("FFJ3",)
-    assert math.isnan(found.position_rad[0])
-    assert counters.bad_angles == 1
+    assert found.names == tuple(angles)
+    assert found.position_rad.tolist() == pytest.approx(list(angles.values()), nan_ok=True)
+    assert {name: n for name, n in counters.as_dict().items() if n} == counted
 
 
 @given(
