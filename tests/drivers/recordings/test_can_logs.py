@@ -216,21 +216,6 @@ def test_times_since_the_frame_before_are_told_from_others(
     assert [reading.made_ns for reading in readings] == times_ns[23::24]
 
 
-def test_times_that_stand_or_fall_between_buses_are_not_steps(tmp_path: Path) -> None:
-    """An adapter may count milliseconds; frames of two buses may come out of order."""
-    times_ns = [at * STEP_NS // 1_000_000 * 1_000_000 for at in range(24 * 9)]
-    coarse, other = shown(times_ns), shown([at * STEP_NS + 90_000 for at in range(24 * 9)])
-    path = tmp_path / "shown.txt"
-    path.write_text(coarse)
-    readings, _ = played([path])
-    assert [reading.made_ns for reading in readings] == times_ns[23::24]
-    own = shown([at * STEP_NS for at in range(24 * 9)]).splitlines(keepends=True)
-    later = other.replace("can0", "can1").splitlines(keepends=True)
-    path.write_text("".join(line for pair in zip(later, own, strict=True) for line in pair))
-    readings, _ = played([path])
-    assert [reading.made_ns for reading in readings] == [at * STEP_NS for at in range(23, 216, 24)]
-
-
 def test_a_clock_that_was_set_back_is_a_pause(tmp_path: Path) -> None:
     """Two logs in one file look like this; no sweep has frames of both."""
     path = tmp_path / "bus.log"

@@ -153,23 +153,6 @@ def test_a_last_row_without_line_end_is_cut_off() -> None:
         rows_of(table(3).rstrip(b"\n"), strict=True)
 
 
-@pytest.mark.parametrize(
-    ("column", "known"),
-    [
-        ("FFJ0", True),
-        ("lh_LFJ5", True),
-        ("FFJ5", False),
-        ("THJ0", False),
-        ("WRJ3", False),
-        ("rh_lh_FFJ3", False),
-    ],
-)
-def test_joints_are_those_of_the_shadow_hand(column: str, known: bool) -> None:
-    found = survey(PATH, io.BytesIO(stream(["0"], {column: ["0"]})), FINGERS)
-    assert (found.columns.ignored == ()) is known
-    assert len(found.joints) == known
-
-
 @pytest.mark.parametrize("cell", ["nan", "", "1e999"])
 def test_an_angle_that_is_not_a_number_is_nan(cell: str) -> None:
     content = stream(["0"], {"FFJ1": ["0.5"], "FFJ2": [cell]})
