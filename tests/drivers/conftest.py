@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import pytest
 
-from tests.drivers.palm.palm_stream import DatagramClock
+from tests.drivers.udp_standin import Receiver
+from tests.kit.clock import Clock
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> DatagramClock:
-    """The clock of a driver, which receives datagrams at its time."""
-    clock = DatagramClock()
-    clock.rule(monkeypatch)
-    return clock
+def receiver(monkeypatch: pytest.MonkeyPatch) -> Receiver:
+    """What a driver opens in place of a socket."""
+    receiver = Receiver()
+    monkeypatch.setattr("graspd.drivers.udp.DatagramReceiver", lambda *_: receiver)
+    return receiver
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import socket
 import struct
-from collections.abc import Iterator
 
 import pytest
 
@@ -18,36 +17,11 @@ from graspd.drivers.udp import (
     Endpoint,
 )
 from tests.drivers.palm.palm_stream import MS, joints
+from tests.drivers.udp_standin import HERE, THERE, Receiver
 from tests.kit.clock import Clock
 
-HERE, THERE = ("127.0.0.1", 7), ("127.0.0.1", 8)
 SILENCE_NS = 500 * MS
 GOOD = b'{"joints":{"FFJ3":0.1}}'
-
-
-class Receiver:
-    """A socket that hands over what a test puts in, and breaks when there is an exception."""
-
-    port = 5700
-
-    def __init__(self, dropped: int = 0) -> None:
-        self.waiting: list[Datagram | LinkError] = []
-        self.dropped = dropped
-        self.closed = False
-
-    def receive(self, most: int) -> Iterator[Datagram]:
-        while self.waiting and most:
-            most -= 1
-            datagram = self.waiting.pop(0)
-            if isinstance(datagram, LinkError):
-                raise datagram
-            yield datagram
-
-    def fileno(self) -> int:
-        return 99
-
-    def close(self) -> None:
-        self.closed = True
 
 
 class Bench:

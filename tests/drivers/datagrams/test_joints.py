@@ -20,13 +20,15 @@ from graspd.drivers.datagrams.joints import (
 )
 from graspd.drivers.datagrams.messages import Order, Stamp
 from graspd.drivers.link import LinkState
-from tests.drivers.palm.palm_stream import DatagramClock, Sender, joints
+from tests.drivers.palm.palm_stream import joints
+from tests.drivers.udp_standin import Receiver
+from tests.kit.clock import Clock
 
 LOOPBACK = "udp://127.0.0.1:0"
 
 
 @pytest.fixture
-def driver(clock: DatagramClock) -> Iterator[JointStreamDriver]:
+def driver(receiver: Receiver, clock: Clock) -> Iterator[JointStreamDriver]:
     with JointStreamDriver(LOOPBACK, clock=clock) as driver:
         yield driver
 
@@ -107,22 +109,22 @@ def test_a_jump_above_a_thousand_is_a_new_start(step: int, missed: int, restarts
     assert (counters.missed_readings, counters.restarts) == (missed, restarts)
 
 
-def taken(driver: JointStreamDriver, *data: bytes) -> list[JointReading]:
-    with Sender(driver) as sender:
-        sender.send(*data)
-        return joints(driver.read_ready())
-
-
-def test_a_message_is_a_reading_and_a_gap_a_loss(driver: JointStreamDriver) -> None:
-    readings = taken(driver, *(message(seq, FFJ3=seq / 100) for seq in (3, 4, 7, 8)))
+def test_a_message_is_a_reading_and_a_gap_a_loss(
+    driver: JointStreamDriver, receiver: Receiver
+) -> None:
+    receiver.send(*(message(seq, FFJ3=seq / 100) for seq in (3, 4, 7, 8)))
+    readings = joints(driver.read_ready())
     assert [reading.seq for reading in readings] == [0, 1, 4, 5]
     assert [reading.position_rad[0] for reading in readings] == [0.03, 0.04, 0.07, 0.08]
     assert driver.stream.counters.readings == 4
     assert driver.stream.counters.missed_readings == 2
 
 
-def test_a_message_without_a_known_joint_is_not_a_reading(driver: JointStreamDriver) -> None:
-    assert taken(driver, message(1, elbow=0.1), b'{"joints": {}}') == []
+def test_a_message_without_a_known_joint_is_not_a_reading(
+    driver: JointStreamDriver, receiver: Receiver
+) -> None:
+    receiver.send(message(1, elbow=0.1), b'{"joints": {}}')
+    assert driver.read_ready() == []
     assert driver.link.state is LinkState.UP
 
 

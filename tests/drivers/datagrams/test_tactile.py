@@ -15,8 +15,9 @@ from graspd.drivers.datagrams.tactile import TactileStream, TactileStreamDriver
 from graspd.drivers.link import SenderClock
 from graspd.drivers.udp import Datagram
 from tests.drivers.one_sweep import counts_of, number_in, tactile
-from tests.drivers.palm.palm_stream import DatagramClock, Sender, flags
-from tests.drivers.test_udp_link import Receiver
+from tests.drivers.palm.palm_stream import flags
+from tests.drivers.udp_standin import HERE, THERE, Receiver
+from tests.kit.clock import Clock
 
 MS = 1_000_000
 LOOPBACK = "udp://127.0.0.1:0"
@@ -224,26 +225,25 @@ def test_sender_time_that_leaps_is_dropped(times: list[float], readings: int) ->
 
 
 @pytest.fixture
-def driver(clock: DatagramClock) -> Iterator[TactileStreamDriver]:
+def driver(receiver: Receiver, clock: Clock) -> Iterator[TactileStreamDriver]:
     with TactileStreamDriver(LOOPBACK, FINGERS, "right", clock=clock) as driver:
         yield driver
 
 
 def test_gaps_are_losses_and_new_senders_are_other_sensors(
-    driver: TactileStreamDriver, clock: DatagramClock
+    driver: TactileStreamDriver, receiver: Receiver, clock: Clock
 ) -> None:
-    with Sender(driver) as sender, Sender(driver) as other:
-        sender.send(message(seq=3), message(seq=4), message(seq=7))
-        readings = tactile(driver.read_ready())
-        first = dict.fromkeys(FINGERS, f"udp://127.0.0.1:{sender.port}")
-        assert driver.serials == first
-        other.send(message(seq=9))
-        assert list(driver.read_ready()) == []
-        clock.now_ns += 500 * MS
-        assert list(driver.read_ready()) == []
-        other.send(message(seq=9))
-        readings += tactile(driver.read_ready())
-        assert driver.serials == dict.fromkeys(FINGERS, f"udp://127.0.0.1:{other.port}")
+    receiver.send(message(seq=3), message(seq=4), message(seq=7))
+    readings = tactile(driver.read_ready())
+    first = dict.fromkeys(FINGERS, "udp://127.0.0.1:7")
+    assert driver.serials == first
+    receiver.send(message(seq=9), sender=THERE)
+    assert list(driver.read_ready()) == []
+    clock.now_ns += 500 * MS
+    assert list(driver.read_ready()) == []
+    receiver.send(message(seq=9), sender=THERE)
+    readings += tactile(driver.read_ready())
+    assert driver.serials == dict.fromkeys(FINGERS, "udp://127.0.0.1:8")
     assert [reading.seq for reading in readings] == [0, 1, 4, 6]
     assert [reading.interrupted for reading in readings] == [False, False, False, True]
     assert driver.counters.missed_readings == 3
@@ -251,7 +251,6 @@ def test_gaps_are_losses_and_new_senders_are_other_sensors(
 
 
 PERIOD_NS = 10_000_000
-HERE = ("127.0.0.1", 7)
 START_S = 70.0
 ACTIONS = ("send", "lose", "copy", "late", "stall", "stale")
 """What becomes of a sweep. `late`: others overtake it; `stall`: those behind it wait as well;
@@ -298,7 +297,7 @@ def arrivals(
 @settings(max_examples=100, deadline=None)
 @given(links())
 def test_no_count_is_older_than_its_reading_says(plan: Plan) -> None:
-    receiver, clock = Receiver(), DatagramClock()
+    receiver, clock = Receiver(), Clock()
     start_ns = clock.now_ns
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("graspd.drivers.udp.DatagramReceiver", lambda *_: receiver)

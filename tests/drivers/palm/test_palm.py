@@ -16,59 +16,51 @@ from tests.drivers.one_sweep import sweeps_of, tactile
 from tests.drivers.palm.palm_stream import (
     MS,
     ROUND,
-    DatagramClock,
-    Sender,
     datagrams,
     joints,
 )
+from tests.drivers.udp_standin import Receiver
+from tests.kit.clock import Clock
 
 LOOPBACK = "udp://127.0.0.1:0"
 EXAMPLE = ROOT / "deploy" / "calibration" / "example_hand.toml"
 
 
 @pytest.fixture
-def driver(clock: DatagramClock) -> Iterator[PalmDriver]:
+def driver(receiver: Receiver, clock: Clock) -> Iterator[PalmDriver]:
     with PalmDriver(LOOPBACK, clock=clock) as driver:
         yield driver
 
 
-def test_another_kind_of_palm_is_not_mixed_in(driver: PalmDriver) -> None:
-    with Sender(driver) as sender:
-        for one, two in zip(datagrams(2), datagrams(2, Palm.PALM_0230), strict=True):
-            sender.send(one, two)
-        readings = tactile(driver.read_ready())
+def test_another_kind_of_palm_is_not_mixed_in(driver: PalmDriver, receiver: Receiver) -> None:
+    for one, two in zip(datagrams(2), datagrams(2, Palm.PALM_0230), strict=True):
+        receiver.send(one, two)
+    readings = tactile(driver.read_ready())
     assert np.array_equal([reading.counts for reading in readings], sweeps_of(2))
     assert driver.stream.counters.other_palms == 2 * ROUND
 
 
-def test_a_round_wakes_the_loop_once(driver: PalmDriver, clock: DatagramClock) -> None:
-    with Sender(driver) as sender:
-        assert driver.fileno() is not None
-        sender.send(datagrams(1)[0])
-        driver.read_ready()
-        assert driver.fileno() is None  # 13 packets to go
-        assert driver.due_ns() == clock.now_ns + 11 * MS
-        clock.now_ns += 11 * MS
-        assert driver.fileno() is not None
+def test_a_round_wakes_the_loop_once(driver: PalmDriver, receiver: Receiver, clock: Clock) -> None:
+    assert driver.fileno() is not None
+    receiver.send(datagrams(1)[0])
+    driver.read_ready()
+    assert driver.fileno() is None  # 13 packets to go
+    assert driver.due_ns() == clock.now_ns + 11 * MS
+    clock.now_ns += 11 * MS
+    assert driver.fileno() is not None
 
 
-def test_joints_come_calibrated_at_their_own_rate(
-    clock: DatagramClock,
-) -> None:
-    with (
-        PalmDriver(LOOPBACK, calibration=EXAMPLE, clock=clock) as driver,
-        Sender(driver) as sender,
-    ):
-        readings = []
+def test_joints_come_calibrated_at_their_own_rate(receiver: Receiver, clock: Clock) -> None:
+    readings = []
+    with PalmDriver(LOOPBACK, calibration=EXAMPLE, clock=clock) as driver:
         for data in datagrams(72)[:1000]:
-            sender.send(data)
+            receiver.send(data)
             readings += joints(driver.read_ready())
             clock.now_ns += MS
-        assert len(readings) == driver.stream.counters.joint_readings == pytest.approx(100, abs=1)
-        assert driver.stream.counters.bad_angles == 0
-        assert driver.stream.counters.impossible_angles == 2 * len(
-            readings
-        )  # another hand's raw values
+    counters = driver.stream.counters
+    assert len(readings) == counters.joint_readings == pytest.approx(100, abs=1)
+    assert counters.bad_angles == 0
+    assert counters.impossible_angles == 2 * len(readings)  # another hand's raw values
     assert [reading.seq for reading in readings] == list(range(len(readings)))
     angles = dict(zip(readings[0].names, readings[0].position_rad, strict=True))
     # Raw 1303 of the snapshot, by hand from the table of hand 378, noise of one count.
