@@ -13,7 +13,6 @@ from unittest import mock
 import can
 import pytest
 
-from graspd.drivers.can.driver import CanBridgeDriver
 from graspd.drivers.can.frames import CanCounters, CanFrame, encode_sample
 from graspd.drivers.can.stream import CanStream
 from graspd.drivers.kernel_stamps import SO_TIMESTAMPNS
@@ -102,13 +101,6 @@ def stand_in(monkeypatch: pytest.MonkeyPatch, opener: Opener) -> None:
 def channel() -> str:
     """A virtual channel that no other test uses."""
     return f"test-{next(CHANNELS)}"
-
-
-def bridge(where: str, **options: Any) -> CanBridgeDriver:  # noqa: ANN401
-    """A driver on a virtual bus, without the samples that it does not use."""
-    options.setdefault("arbitration_id", SAMPLE_ID)
-    options.setdefault("sequence", "electrodes")
-    return CanBridgeDriver("virtual", where, **options)
 
 
 def message(data: bytes = b"", identifier: int = SAMPLE_ID, **options: bool) -> can.Message:

@@ -12,8 +12,8 @@ import pytest
 from graspd.drivers.base import DriverError
 from graspd.drivers.can.driver import CanBridgeDriver
 from graspd.drivers.link import LinkState
+from graspd.drivers.twins.can import SAMPLE_ID
 from tests.drivers.can.can_standin import (
-    bridge,
     channel,
     message,
     sweep_messages,
@@ -57,7 +57,8 @@ def test_frames_that_are_not_ours_are_counted_and_harm_nothing() -> None:
         (message(bytes(range(64)), is_fd=True), "malformed_frames"),
     ]
     clock = Clock()  # a stalled machine would cut the sweep
-    driver = bridge(where, clock=clock, wall_clock=clock)
+    options: dict[str, Any] = {"arbitration_id": SAMPLE_ID, "sequence": "electrodes"}
+    driver = CanBridgeDriver("virtual", where, clock=clock, wall_clock=clock, **options)
     with driver, can.Bus(interface="virtual", channel=where, ignore_config=True) as bus:
         for at, (sent, _) in enumerate(strange):
             bus.send(ours[at])

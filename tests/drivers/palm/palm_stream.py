@@ -25,9 +25,6 @@ class Played:
     counters: PalmCounters
     readings: list[TactileReading] = field(default_factory=list)
 
-    def sound(self) -> list[TactileReading]:
-        return [reading for reading in self.readings if not reading.faults.any()]
-
 
 def play(cycles: Iterable[Sequence[bytes]], fingers: Sequence[str] = FINGERS) -> Played:
     """Datagrams by the millisecond through a stream, as the driver does it."""

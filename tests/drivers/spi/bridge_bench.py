@@ -7,7 +7,7 @@ import os
 import select
 import time
 import tty
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -29,7 +29,6 @@ from graspd.drivers.spi.messages import (
     decode,
     encode,
 )
-from graspd.drivers.twins.spi import SpiTwin
 from tests.drivers.one_sweep import tactile
 from tests.kit.clock import Clock
 
@@ -195,25 +194,3 @@ class Rig:
         self.bridge.send(hello(ping.nonce))
         take(self.driver, self.bridge)
         return heard
-
-
-def run(
-    twin: SpiTwin, driver: SpiBridgeDriver, done: Callable[[list[TactileReading]], bool]
-) -> list[TactileReading]:
-    """Both in turns, in real time, until `done` with the readings so far."""
-    readings: list[TactileReading] = []
-    deadline = time.monotonic() + PATIENCE_S
-    while not done(readings):
-        assert time.monotonic() < deadline, f"{len(readings)} readings; {driver.counters}"
-        twin.run_once()
-        due_ns = driver.due_ns()
-        if (due_ns is not None and time.monotonic_ns() >= due_ns) or is_readable(driver):
-            readings += tactile(driver.read_ready())
-        else:
-            time.sleep(0.0002)
-    return readings
-
-
-def is_readable(driver: SpiBridgeDriver) -> bool:
-    descriptor = driver.fileno()
-    return descriptor is not None and bool(select.select([descriptor], [], [], 0)[0])

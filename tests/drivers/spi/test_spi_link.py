@@ -11,14 +11,16 @@ from pathlib import Path
 
 import pytest
 
+from graspd.drivers.base import TactileReading
 from graspd.drivers.link import LinkState
 from graspd.drivers.spi.driver import SerialLine, SpiBridgeDriver
 from graspd.drivers.spi.messages import DIGEST, Ping, Start, Stop, encode, encode_frame
 from graspd.drivers.twins.faults import LinkFaults
 from graspd.drivers.twins.spi import SpiTwin
-from tests.drivers.one_sweep import sweeps_of
-from tests.drivers.spi.bridge_bench import FINGERS, MS, Rig, ScriptedBridge, hello, run, sweep, take
+from tests.drivers.one_sweep import sweeps_of, tactile
+from tests.drivers.spi.bridge_bench import FINGERS, MS, Rig, ScriptedBridge, hello, sweep, take
 from tests.kit.clock import Clock
+from tests.kit.waiting import wait_until
 
 
 @pytest.fixture
@@ -146,8 +148,15 @@ def test_a_link_broken_within_a_frame_comes_back(tmp_path: Path) -> None:
     faults = LinkFaults(disconnect_every_frames=40)
     rows = sweeps_of(100_000 // 24)
     twin = SpiTwin(tmp_path / "b", rows, rate_hz=1000.0, faults=faults)
+    readings: list[TactileReading] = []
     with twin, SpiBridgeDriver(str(tmp_path / "b"), FINGERS) as driver:
-        readings = run(twin, driver, lambda _: driver.counters.link_losses >= 6)
+
+        def is_lost_often() -> bool:
+            twin.run_once()
+            readings.extend(tactile(driver.read_ready()))
+            return driver.counters.link_losses >= 6
+
+        wait_until(is_lost_often, step_s=0.0002)
         # The twin may break the link again before the driver notices.
         assert driver.counters.link_losses <= twin.injected["disconnect"] <= 7
     made = {row.tobytes() for row in rows[: twin.sweeps_made]}
