@@ -1,13 +1,19 @@
-"""Sweeps of the serial bridge: what becomes of words, sensors and numbers."""
+"""Sweeps of the serial bridge: what becomes of words, sensors, numbers and ticks."""
 
 from __future__ import annotations
 
+import random
+from collections.abc import Iterator
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from graspd.drivers.base import ElectrodeFault
 from graspd.drivers.biotac import E1, PAC, SEQUENCES, TDC
-from graspd.drivers.spi.sweeps import BridgeCounters, DeviceClock, SweepDecoder
+from graspd.drivers.spi.sweeps import BridgeCounters, ClockError, DeviceClock, SweepDecoder
 from tests.drivers.spi.bridge_bench import T0, greeted, hear, hello, opened, sweep, words
 
 
@@ -87,3 +93,209 @@ def test_a_bridge_that_is_started_again_interrupts() -> None:
             assert reading is not None
             interrupted.append(reading.interrupted)
     assert interrupted == [False, False, False, True, False, False]
+
+
+MS = 1_000_000
+S = 1_000_000_000
+TICK_HZ = 1_000_000
+START_NS = 5_000 * S
+"""Host time when the device was reset: any large number."""
+AGE_MAX_NS = 10 * S
+DOUBT_NS = 20 * MS
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """How messages travel, both ways, and how the device's clock runs."""
+
+    jitter_ms: float = 1.0
+    """Mean of an exponential delay, both ways."""
+    batch_ms: float = 16.0
+    """Arrivals wait for the next multiple of this; 0 for none."""
+    lag_ms: float = 0.0
+    """Delay of every message, both ways, as of a line that is full."""
+    drifts_ppm: tuple[float, ...] = (0.0,)
+    """How much the device's clock is fast, second by second, again and again."""
+    stall_probability: float = 0.0
+    """Chance that a message waits for up to a second more, on either way."""
+    tick_hz: int = TICK_HZ
+    seed: int = 0
+
+    def tick(self, host_ns: int) -> int:
+        seconds, rest_ns = divmod(host_ns - START_NS, S)
+        turns, rest = divmod(seconds, len(self.drifts_ppm))
+        past_ppm = turns * sum(self.drifts_ppm) + sum(self.drifts_ppm[:rest])
+        ahead_ns = past_ppm * 1e3 + self.drifts_ppm[rest] * rest_ns / 1e6
+        return (host_ns - START_NS + round(ahead_ns)) * self.tick_hz // S
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """A sweep, or an answered PING if `sent_ns` is not None. Times are host ns."""
+
+    made_ns: int
+    arrival_ns: int
+    sent_ns: int | None = None
+
+
+def events(way: Way, duration_s: int) -> Iterator[Event]:
+    """Sweeps at 100 Hz and PINGs, four a second, in order of arrival."""
+    rng = random.Random(way.seed)
+    batch_ns = round(way.batch_ms * MS)
+
+    def delay_ns() -> int:
+        delay_ms = rng.expovariate(1.0 / way.jitter_ms) if way.jitter_ms else 0.0
+        stall_ms = rng.uniform(0.0, 1000.0) if rng.random() < way.stall_probability else 0.0
+        return round((delay_ms + stall_ms + way.lag_ms) * MS)
+
+    def arrival_ns(made_ns: int) -> int:
+        ready_ns = made_ns + delay_ns()
+        return -(-ready_ns // batch_ns) * batch_ns if batch_ns else ready_ns
+
+    made = []
+    for k in range(duration_s * 100):
+        made_ns = START_NS + S + k * S // 100
+        made.append(Event(made_ns, arrival_ns(made_ns)))
+    for send_ms in range(0, 1000 * duration_s, 247):
+        sent_ns = START_NS + S + send_ms * MS
+        made_ns = sent_ns + delay_ns()
+        made.append(Event(made_ns, arrival_ns(made_ns), sent_ns))
+    last_ns = 0
+    for event in sorted(made, key=lambda event: event.made_ns):  # a serial line keeps the order
+        last_ns = max(last_ns, event.arrival_ns)
+        yield Event(event.made_ns, last_ns, event.sent_ns)
+
+
+def too_old_ns(way: Way, duration_s: int) -> Iterator[tuple[int, int]]:
+    """Yield by how much each sweep after the first answer looks too old, and the most allowed.
+
+    The most is the way of a PING to the device, half a thousandth of the time since, by what the
+    rate may be wrong on top of how it is wrong, and two ticks.
+    """
+    pings: list[tuple[int, int]] = []
+    clock = None
+    for event in events(way, duration_s):
+        tick = way.tick(event.made_ns)
+        if event.sent_ns is not None:
+            pings = [*pings[-7:], (event.sent_ns, event.made_ns)]
+            if clock is None:
+                clock = DeviceClock(way.tick_hz, tick, event.sent_ns, event.arrival_ns)
+            clock.round_trip(tick, event.sent_ns, event.arrival_ns)
+        elif clock is not None and event.made_ns > pings[0][1] + MS:
+            most_ns = min(
+                made_ns - sent_ns + round(abs(event.made_ns - made_ns) * 1.001e-3)
+                for sent_ns, made_ns in pings
+            )
+            too_old = event.made_ns - clock.host_ns(tick, event.arrival_ns)
+            yield too_old, most_ns + 2 * S // way.tick_hz + 2
+
+
+ways = st.builds(
+    Way,
+    jitter_ms=st.floats(0.0, 20.0),
+    batch_ms=st.sampled_from([0.0, 1.0, 16.0]),
+    drifts_ppm=st.lists(st.floats(-499.0, 499.0), min_size=1, max_size=5).map(tuple),
+    stall_probability=st.sampled_from([0.0, 0.01, 0.2]),
+    tick_hz=st.sampled_from([1_000, TICK_HZ, 133_000_000]),
+    seed=st.integers(0, 2**32),
+)
+
+
+@given(ways)
+def test_no_reading_looks_newer_than_it_is(way: Way) -> None:
+    for too_old, most in too_old_ns(way, 12):
+        assert 0 <= too_old <= most
+
+
+@pytest.mark.parametrize("drift_ppm", [-100.0, 100.0])
+def test_with_batches_a_time_is_right_to_two_milliseconds(drift_ppm: float) -> None:
+    """Drawn delays, so measured: `deploy/MEASURED.md`."""
+    way = Way(drifts_ppm=(drift_ppm,), seed=1)
+    errors_ms = np.array([too_old / MS for too_old, _ in too_old_ns(way, 120)])
+    assert len(errors_ms) > 11_900
+    assert errors_ms[1000:].max() < 2.0
+    assert np.median(errors_ms) < 0.6
+
+
+def exact(pings: int, wrong_ppm: int = 0) -> tuple[DeviceClock, int]:
+    """A clock after PINGs that took no time, one a second; host time of the last, ns."""
+    clock = DeviceClock(TICK_HZ, TICK_HZ, START_NS, START_NS)
+    for second in range(1, pings):
+        now_ns = START_NS + second * S
+        clock.round_trip(TICK_HZ + second * (TICK_HZ + wrong_ppm), now_ns, now_ns)
+    return clock, START_NS + (pings - 1) * S
+
+
+@pytest.mark.parametrize("tick", [0, TICK_HZ, 3 * TICK_HZ + 5000])
+def test_a_clock_that_does_not_move_on_is_wrong(tick: int) -> None:
+    """Reset, or standing since the first PING or the last reading."""
+    clock, now_ns = exact(3)
+    clock.host_ns(3 * TICK_HZ + 5000, now_ns + 5 * MS)
+    with pytest.raises(ClockError, match="stands or falls back"):
+        clock.host_ns(tick, now_ns + 20 * MS)
+
+
+@pytest.mark.parametrize(("ahead_us", "is_wrong"), [(6, False), (7, True)])
+def test_a_clock_ahead_of_its_readings_is_doubted(ahead_us: int, is_wrong: bool) -> None:
+    clock, now_ns = exact(3)
+    arrival_ns = now_ns + 10 * MS  # wrong by 5 us at most, and by a tick
+    tick = 3 * TICK_HZ + 10_000 + ahead_us
+    if not is_wrong:
+        assert clock.host_ns(tick, arrival_ns) == arrival_ns - 3  # 6000 less 5003 and 1000
+        return
+    assert clock.host_ns(tick, arrival_ns) == arrival_ns - DOUBT_NS
+    assert clock.is_doubted
+
+
+@pytest.mark.parametrize("wrong_ppm", [-501, -499, 499, 501])
+def test_a_rate_wrong_by_500_ppm_is_a_fault(wrong_ppm: int) -> None:
+    clock, now_ns = exact(11, wrong_ppm)
+    assert clock.is_doubted == (abs(wrong_ppm) > 500)
+    tick = 11 * TICK_HZ + 10 * wrong_ppm
+    clock.round_trip(tick + TICK_HZ, now_ns + S, now_ns + S)
+    assert not clock.is_doubted
+
+
+@given(st.floats(-80_000.0, 80_000.0), st.integers(0, 99))
+def test_a_wrong_rate_makes_no_reading_20_ms_newer(wrong_ppm: float, seed: int) -> None:
+    """Rates are wrong while a computer's time is set; round trips hide less than their length."""
+    too_old = [ns for ns, _ in too_old_ns(Way(drifts_ppm=(wrong_ppm,), seed=seed), 5)]
+    assert min(too_old) >= -DOUBT_NS
+
+
+@pytest.mark.parametrize(("wrong_ppm", "lag_ms"), [(600, 120), (3_000, 150), (10_000, 400)])
+def test_a_wrong_rate_hides_no_age_on_a_slow_line(wrong_ppm: float, lag_ms: float) -> None:
+    way = Way(batch_ms=0.0, drifts_ppm=(wrong_ppm,), lag_ms=lag_ms)
+    too_old = [ns for ns, _ in too_old_ns(way, 300)]
+    assert len(too_old) > 29_000
+    assert min(too_old) >= 0
+
+
+def test_a_time_by_a_wrong_bound_is_not_kept() -> None:
+    """The clock gained 90 ms where readings come 150 ms late; a PING shows it."""
+    clock, now_ns = exact(3)
+    tick = 3 * TICK_HZ + 90_000
+    assert clock.host_ns(tick, now_ns + 150 * MS) > now_ns + 80 * MS
+    clock.round_trip(tick + 10_000, now_ns + 10 * MS, now_ns + 10 * MS)
+    assert clock.host_ns(tick + 20_000, now_ns + 170 * MS) <= now_ns + 20 * MS
+
+
+def test_no_reading_is_older_than_ten_seconds() -> None:
+    for seconds, age_ns in ((9, 9 * S - 1000 * 1000 + 1500), (11, AGE_MAX_NS)):
+        clock, now_ns = exact(3)
+        arrival_ns = now_ns + seconds * S
+        assert clock.host_ns(3 * TICK_HZ + 1000, arrival_ns) == arrival_ns - age_ns
+
+
+@given(ways, st.integers(3 * S, 3600 * S), st.booleans())
+def test_a_clock_that_jumps_is_wrong_at_once(way: Way, jump_ns: int, back: bool) -> None:
+    """A computer that slept, whose clock stood meanwhile; a counter that wraps or is reset."""
+    clock = DeviceClock(way.tick_hz, way.tick(START_NS), START_NS, START_NS + S)
+    sweeps = [event for event in events(way, 5) if event.sent_ns is None]
+    for event in sweeps[:200]:
+        clock.host_ns(way.tick(event.made_ns), event.arrival_ns)
+    tick = way.tick(sweeps[200].made_ns)
+    with pytest.raises(ClockError):
+        clock.host_ns(
+            tick % 1000 if back else tick + jump_ns * way.tick_hz // S, sweeps[200].arrival_ns
+        )
