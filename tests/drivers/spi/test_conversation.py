@@ -145,18 +145,17 @@ def words_of(conversation: Conversation) -> dict[str, str]:
 @pytest.mark.parametrize(
     ("serials", "numbers", "sensors", "errors"),
     [
-        ("A B C", (0, 0, 0), Fact("A, B, C"), Fact("0, 0, 0")),
-        ("A B A", (0, 0, 0), Fact("A, B, A", DeviceFault.SENSOR_TWICE), Fact("0, 0, 0")),
-        ("A  C", (0, 9, 0), Fact("A, none, C", DeviceFault.SENSOR_ABSENT), Fact("0, -, 0")),
-        ("A B C", (9, 0, 0), Fact("A, B, C"), Fact("9, 0, 0", DeviceFault.SENSOR_WORDS)),
-        ("  ", (0, 0, 0), Fact("none, none, none", DeviceFault.NO_SENSOR), Fact("-, -, -")),
+        (("A", "B", "C"), (0, 0, 0), Fact("A, B, C"), Fact("0, 0, 0")),
+        (("A", "B", "A"), (0, 0, 0), Fact("A, B, A", DeviceFault.SENSOR_TWICE), Fact("0, 0, 0")),
+        (("A", "", "C"), (0, 9, 0), Fact("A, none, C", DeviceFault.SENSOR_ABSENT), Fact("0, -, 0")),
+        (("A", "B", "C"), (9, 0, 0), Fact("A, B, C"), Fact("9, 0, 0", DeviceFault.SENSOR_WORDS)),
+        (("", "", ""), (0, 0, 0), Fact("none, none, none", DeviceFault.NO_SENSOR), Fact("-, -, -")),
     ],
 )
 def test_sensors_that_are_absent_twice_or_misread_are_a_fault(
-    serials: str, numbers: tuple[int, ...], sensors: Fact, errors: Fact
+    serials: tuple[str, ...], numbers: tuple[int, ...], sensors: Fact, errors: Fact
 ) -> None:
-    about = dataclasses.replace(hello(0), serials=tuple(serials.split(" ")))
-    conversation = greeted(about)
+    conversation = greeted(dataclasses.replace(hello(0), serials=serials))
     hear(conversation, BridgeStatus(1, 0, 0, 0, 0, numbers), T0)
     assert conversation.describe()["sensors"] == sensors
     assert conversation.describe()["spi errors"] == errors
