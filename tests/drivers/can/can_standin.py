@@ -43,8 +43,9 @@ class SocketBus:
         self.shutdown()
         self.far_end.close()
 
-    def send(self, frame: CanFrame) -> None:
-        self.far_end.send(pack_frame(frame))
+    def send(self, *frames: CanFrame) -> None:
+        for frame in frames:
+            self.far_end.send(pack_frame(frame))
 
     def fileno(self) -> int:
         return self.socket.fileno()

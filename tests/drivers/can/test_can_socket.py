@@ -55,8 +55,7 @@ def test_a_socketcan_bus_is_read_from_its_socket(socket_bus: SocketBus) -> None:
         assert driver.fileno() == socket_bus.socket.fileno()
         assert socket_bus.socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) >= 212_992
         assert driver.due_ns() is None
-        for frame in sweep_of_frames(0):
-            socket_bus.send(frame)
+        socket_bus.send(*sweep_of_frames(0))
         (reading,) = tactile(driver.read_ready())
         assert (reading.counts == counts_of(0)).all()
         assert driver.read_ready() == []
@@ -70,8 +69,7 @@ def test_a_wall_clock_step_makes_no_frame_of_the_future(
 ) -> None:
     with over_socket(wall_clock=lambda: time.time_ns() + step_ns) as driver:
         before_ns = time.monotonic_ns()
-        for frame in sweep_of_frames(0):
-            stamped_bus.send(frame)
+        stamped_bus.send(*sweep_of_frames(0))
         asked_ns = time.monotonic_ns()
         readings = tactile(driver.read_ready())
         read_ns = time.monotonic_ns()
@@ -87,8 +85,7 @@ def test_bus_off_loses_the_link_and_its_sweep(
         buses = [first, second]
         stand_in(monkeypatch, lambda: buses.pop(0))
         with over_socket(clock=clock, wall_clock=clock) as driver:
-            for frame in sweep_of_frames(0) + sweep_of_frames(1)[:9]:
-                first.send(frame)
+            first.send(*sweep_of_frames(0), *sweep_of_frames(1)[:9])
             first.send(CanFrame(0x040, bytes(8), ERROR))
             assert len(driver.read_ready()) == 1
             assert driver.stream.link.state is LinkState.WAITING
@@ -96,8 +93,7 @@ def test_bus_off_loses_the_link_and_its_sweep(
             due_ns = driver.due_ns()
             assert due_ns is not None
             clock.now_ns = due_ns
-            for frame in sweep_of_frames(2)[9:] + sweep_of_frames(3):
-                second.send(frame)
+            second.send(*sweep_of_frames(2)[9:], *sweep_of_frames(3))
             (reading,) = tactile(driver.read_ready())
             assert (reading.counts == counts_of(3)).all()
             counters = driver.counters
@@ -108,8 +104,7 @@ def test_an_overflow_of_the_controller_cuts_the_sweep_there(socket_bus: SocketBu
     with over_socket() as driver:
         frames = sweep_of_frames(0)
         frames[3:5] = [CanFrame(0x004, bytes.fromhex("0001000000000000"), ERROR)]
-        for frame in [*frames, *sweep_of_frames(1)]:
-            socket_bus.send(frame)
+        socket_bus.send(*frames, *sweep_of_frames(1))
         cut, whole = tactile(driver.read_ready())
         assert (cut.counts[:, :3] == counts_of(0)[:, :3]).all()
         assert (cut.faults[:, 3:] == ElectrodeFault.MISSING).all()
@@ -122,8 +117,7 @@ def test_records_that_are_not_frames_are_counted(socket_bus: SocketBus) -> None:
     with over_socket() as driver:
         for record in (b"\1", bytes(15), bytes(71), pack_frame(CanFrame(1, b"")) + b"\0"):
             socket_bus.far_end.send(record)
-        for frame in sweep_of_frames(0):
-            socket_bus.send(frame)
+        socket_bus.send(*sweep_of_frames(0))
         assert len(driver.read_ready()) == 1
         assert driver.counters.malformed_frames == 4
 
