@@ -21,6 +21,7 @@ from graspd.drivers.twins.grasps import synthetic
 from graspd.drivers.twins.grasps.grasp_script import JOINT_NAMES, Durations
 from graspd.drivers.twins.grasps.synthetic import COUNTS, GraspMixtures, SyntheticGrasps
 from graspd.drivers.twins.grasps.whole_grasps import PALM_RATE_HZ, GraspRow, synthetic_grasps
+from tests.kit.tables import write_table
 
 TABLE_GRASPS = 200
 DAY_GRASPS = 300
@@ -66,16 +67,6 @@ def draw_day(model: GraspMixtures, rng: np.random.Generator, grasps: int) -> Syn
     return SyntheticGrasps(readable, drawn.slipped, drawn.component)
 
 
-def write_table(grasps: SyntheticGrasps, file: TextIO) -> None:
-    """Write a grasp table in the layout of the BioTac SP Stability Set."""
-    electrodes = [name for finger in TABLE_FINGERS for name in electrode_columns(finger)]
-    file.write(",".join([OBJECT, SLIPPED, *electrodes]) + "\n")
-    rows = zip(grasps.component, grasps.slipped, grasps.counts, strict=True)
-    for component, slipped, counts in rows:
-        cells = [f"{synthetic.OBJECT_PREFIX}_{component + 1}", int(slipped), *counts]
-        file.write(",".join(map(str, cells)) + "\n")
-
-
 def write_stream(rows: Iterable[GraspRow], file: TextIO, t_decimals: int) -> None:
     """Write a stream of ff, mf, th; the label is 0 before the first grasp."""
     electrodes = [name for finger in TABLE_FINGERS for name in electrode_columns(finger)]
@@ -93,8 +84,8 @@ def main(folder: Path = DEMO_TABLE.parent) -> None:
     table = synthetic.draw(model, np.random.default_rng(SEED), TABLE_GRASPS)
     day = draw_day(model, np.random.default_rng(SEED), DAY_GRASPS)
     for grasps, demo in ((table, DEMO_TABLE), (day, DEMO_DAY)):
-        with (folder / demo.name).open("w", encoding="utf-8", newline="") as file:
-            write_table(grasps, file)
+        objects = [f"{synthetic.OBJECT_PREFIX}_{each + 1}" for each in grasps.component]
+        write_table(folder / demo.name, grasps.counts.reshape(-1, 3, 24), grasps.slipped, objects)
     stream = synthetic_grasps(STREAM_GRASPS, held=True, durations=STREAM_DURATIONS)
     watched = synthetic_grasps(SHOW_GRASPS, rate_hz=PALM_RATE_HZ, durations=SHOW_DURATIONS)
     for rows, demo, decimals in ((stream, DEMO_RECORDING, 2), (watched, SHOW_RECORDING, 3)):

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +10,7 @@ from numpy.typing import NDArray
 
 from graspd.models.contract import Dataset
 from graspd.models.training.data.datasets import Grasps, concatenate
+from tests.kit.tables import write_table
 
 UNKNOWN = ("juice", "aquarius", "green_gel", "tennis", "football", "milk", "metal_pen_case",
            "train")  # fmt: skip
@@ -26,27 +25,6 @@ def separable_counts(grasps: int, seed: int = 7) -> tuple[NDArray[np.uint16], ND
     ramp = np.linspace(-600.0, 600.0, 24) * np.where(slipped, 1.0, -1.0)[:, None, None]
     counts = 2000.0 + ramp + random.normal(0.0, 120.0, (grasps, 3, 24))
     return counts.astype(np.uint16), slipped
-
-
-def write_table(
-    path: Path,
-    counts: NDArray[np.uint16],
-    slipped: NDArray[np.bool_],
-    objects: Sequence[str] | None = None,
-    fingers: Sequence[str] = ("ff", "mf", "th"),
-) -> None:
-    """Write a grasp table in the published form; without `objects`, of balls.
-
-    `counts`: shape (N, fingers, 24), of these `fingers`.
-    """
-    header = ["object", "slipped"]
-    header += [f"{finger}_biotac_{n}" for finger in fingers for n in range(1, 25)]
-    names = ["ball"] * len(counts) if objects is None else objects
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(header)
-        for name, slip, reading in zip(names, slipped, counts, strict=True):
-            writer.writerow([name, int(slip), *reading.ravel()])
 
 
 def table(name: str, grasps: int, seed: int, drift: int = 0) -> Grasps:

@@ -19,13 +19,13 @@ from graspd.models.training.data.datasets import Grasps
 from graspd.models.training.making import make_model
 from graspd.models.training.making.export import ExportError
 from tests.kit.inside import graspd
+from tests.kit.tables import write_table
 from tests.models.training.samples import (
     OBJECTS,
     separable_counts,
     table,
     write,
     write_sessions,
-    write_table,
 )
 
 SYSTEM = "svm-session"

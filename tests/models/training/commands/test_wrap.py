@@ -17,7 +17,8 @@ import torch
 import graspd
 from graspd.models.runtime import TactileModel
 from tests.kit.inside import graspd as command
-from tests.models.training.samples import separable_counts, write_table
+from tests.kit.tables import write_table
+from tests.models.training.samples import separable_counts
 
 PAGE = Path(__file__).parents[4] / "deploy" / "RECORDING.md"
 pytestmark = [

@@ -19,12 +19,12 @@ from graspd.models.training.data.datasets import (
     read_with_lab_tables,
     unpublished,
 )
+from tests.kit.tables import write_table
 from tests.models.training.samples import (
     separable_counts,
     table,
     write,
     write_sessions,
-    write_table,
 )
 
 # Grasps, stable, slip, SHA-256: as recorded when the data was taken in.

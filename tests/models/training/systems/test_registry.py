@@ -58,17 +58,6 @@ def test_every_smaller_hand_has_a_default_system() -> None:
         assert digest(replace(system, fingers=whole.fingers)) == digest(whole)
 
 
-def test_grasps_of_fewer_fingers_are_those_columns() -> None:
-    grasps = sessions(60)
-    two = grasps.of_fingers(("ff", "th"))
-    np.testing.assert_array_equal(two.counts, grasps.counts[:, [0, 2]])
-    np.testing.assert_array_equal(two.slipped, grasps.slipped)
-    with pytest.raises(ValueError, match="have not the fingers lf"):
-        grasps.of_fingers(("lf",))
-    with pytest.raises(ValueError, match="have not the fingers mf"):
-        two.of_fingers(("mf",))
-
-
 def test_what_the_other_fingers_feel_changes_nothing() -> None:
     grasps = sessions(120)
     other = replace(grasps, counts=grasps.counts.copy())
