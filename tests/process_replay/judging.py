@@ -24,10 +24,11 @@ from graspd.daemon.run.loop import Loop, LoopTiming
 from graspd.daemon.scene import Scene
 from graspd.daemon.scene.scene import Record
 from graspd.daemon.trust.lift_book import GraspId, Report
-from graspd.drivers.base import DriverCounters, Fact, Reading, TactileReading
+from graspd.drivers.base import Reading, TactileReading
+from tests.daemon.fakes import FakeDriver
 from tests.kit.clock import Clock
 from tests.kit.loops import ClockSelector
-from tests.process_replay.streams import FINGERS, PERIOD_NS, START_NS
+from tests.process_replay.streams import FINGERS, START_NS
 
 BOOT_ID: Final = "0123456789abcdef" * 2
 ASKED_EVERY: Final = 40
@@ -125,42 +126,27 @@ def _scene(case: Case) -> Scene:
     return scene.parse({**sections, **case.sections}, Path("process replay"))
 
 
-class _Driver:
+class _Driver(FakeDriver):
     """Hands over all readings that are due."""
 
     name = "stream"
-    period_ns: int | None = PERIOD_NS
 
     def __init__(self, readings: Iterator[Reading], clock: Clock, *, live: bool) -> None:
+        super().__init__([], clock)
         self.live = live
-        self.counters = DriverCounters()
-        self.serials: dict[str, str] = {}
         self._readings = readings
-        self._clock = clock
         self._next = next(readings, None)
 
     @property
     def exhausted(self) -> bool:
         return self._next is None
 
-    def describe(self) -> dict[str, Fact]:
-        return {}
-
-    def open(self) -> None:
-        """There is nothing to open."""
-
-    def close(self) -> None:
-        """There is nothing to close."""
-
-    def fileno(self) -> int | None:
-        return None
-
     def due_ns(self) -> int | None:
         return None if self._next is None else self._next.t_ns
 
     def read_ready(self) -> Sequence[Reading]:
         ready: list[Reading] = []
-        while self._next is not None and self._next.t_ns <= self._clock():
+        while self._next is not None and self._next.t_ns <= self.clock():
             ready.append(self._next)
             self.counters.readings += isinstance(self._next, TactileReading)
             self._next = next(self._readings, None)
