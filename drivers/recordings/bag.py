@@ -99,6 +99,8 @@ class BagDriver(ReadingsDriver[Reading]):
         self.counters = BagCounters()
         self._rows = [list[str](FINGERS).index(finger) for finger in self._fingers]
         self._last: NDArray[np.int64] | None = None
+        self._old = 0
+        """Messages of the time of the one before, or of an earlier time."""
 
     def open(self) -> None:
         """Check that each bag has these fingers, then start. Raises `RecordingError`."""
@@ -135,6 +137,10 @@ class BagDriver(ReadingsDriver[Reading]):
                     reading = self._reading_of(path, t_ns, message)
                     if reading is not None:
                         yield t_ns, reading
+        if self._old > self.counters.readings:
+            problem = "%s: the header of %d of %d messages has no newer stamp than the one before"
+            of = self._old + self.counters.readings
+            _log.warning(problem, self.paths[0], self._old, of)
 
     def _reading_of(self, path: Path, t_ns: int, message: Any) -> Reading | None:  # noqa: ANN401
         if not hasattr(message, "tactiles"):
@@ -146,6 +152,7 @@ class BagDriver(ReadingsDriver[Reading]):
         last_ns, values = self._last_ns, sensors[self._rows]
         if last_ns is not None and 0 <= last_ns - t_ns < REPEAT_NS:
             self.counters.repeats += 1
+            self._old += 1
             return None
         if self._last is not None and np.array_equal(values, self._last):
             self.counters.repeats += 1

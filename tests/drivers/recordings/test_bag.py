@@ -158,6 +158,14 @@ def test_a_repeat_is_dropped_and_counted(
     assert driver.counters.repeats == repeats
 
 
+def test_stamps_that_stand_still_are_named(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = BagOf(1).write(tmp_path / "hand.bag", [each._replace(t_ns=10**18) for each in noise(30)])
+    assert len(readings_of(path)) == 1
+    assert "header of 29 of 30 messages has no newer stamp" in caplog.text
+
+
 def held(sweeps: list[Sweep], *, same_stamp: bool) -> list[Sweep]:
     """Each fourth and seventh of seven is the one before."""
     found: list[Sweep] = []
