@@ -33,7 +33,7 @@ from graspd.biotac import Finger
 from graspd.daemon.record.mcap import METADATA, RecordingHeader
 from graspd.daemon.record.topics import Topic
 from graspd.drivers.base import RecordingError
-from graspd.drivers.recordings.kinds import is_packed, open_recording
+from graspd.drivers.recordings.kinds import PAGE, is_packed, open_recording
 
 RECORD_MAX_BYTES: Final = 64 << 20
 """Largest record, bytes; a longer one is damaged."""
@@ -222,7 +222,8 @@ class McapReader:
             raise RecordingError(self.path, "is empty: nothing was recorded") from damage
         if damage is not None:
             raise RecordingError(self.path, f"is not an MCAP file: {damage}") from damage
-        raise RecordingError(self.path, "is an MCAP file, but not one of graspd's")
+        problem = f"is an MCAP file, but not one of graspd's; {PAGE} lists what graspd reads"
+        raise RecordingError(self.path, problem)
 
     def _messages(self, offset_ns: int) -> Iterator[RecordedMessage]:
         """Yield the messages of all parts; `offset_ns`: log time less monotonic time."""
