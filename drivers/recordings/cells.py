@@ -12,7 +12,7 @@ from typing import BinaryIO, Final
 
 from graspd.biotac import FINGERS
 from graspd.drivers.base import RecordingError
-from graspd.drivers.recordings.columns import has_electrodes, with_units
+from graspd.drivers.recordings.columns import has_electrodes, is_electrode, with_units
 from graspd.drivers.recordings.kinds import (
     HEAD_BYTES,
     LINE_LENGTH_MAX,
@@ -219,5 +219,5 @@ def _merged(above: Sequence[str], names: Sequence[str]) -> list[str]:
     for top, name in zip_longest(above, names, fillvalue=""):
         finger = top.strip() or finger
         both = f"{finger}_{name.strip()}"
-        merged.append(both if has_electrodes([both]) else name or top)
+        merged.append(both if is_electrode(both) else name or top)
     return merged

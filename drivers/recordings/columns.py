@@ -41,6 +41,9 @@ SCHEMES: Final[Mapping[str, re.Pattern[str]]] = {
 that of Shadow's message BiotacAll, of ff, mf, rf, lf, th. The fifth, of BioTacHand, names no
 finger, and the last one is of a single finger."""
 
+ONE_ROW: Final = "put all fingers into one row, as ff_e1 and mf_e1"
+HEADER_ELECTRODES_MIN: Final = 12
+"""Fewest electrodes by which a line below others is the header: half of a finger's."""
 _PLACES: Final[Mapping[str, int]] = {finger: place for place, finger in enumerate(FINGERS)}
 _UNIT_S: Final = {
     **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), 1.0),
@@ -65,6 +68,10 @@ _TIME_NAME: Final = re.compile(
 _IN_UNIT: Final = re.compile(rf"(?P<before>.*)[(\[](?P<unit>{_UNITS})[)\]]", re.IGNORECASE)
 _UNIT: Final = re.compile(r"\s*[(\[]([^\W\d][^)\]]*|-)[)\]]")
 """A unit behind the name of a column."""
+_OF_A_FINGER: Final = re.compile(
+    r"(?:finger(?:[_ ]?tip)?|digit|sensor|biotac|tip)(?:[_ ]?(?:name|id|no|nr|index))?|frame_id",
+    re.IGNORECASE,
+)
 UNITS: Final = frozenset((*_UNIT_S, "counts", "count", "raw", "adc", "lsb", "bits", "rad", "deg"))
 
 
@@ -104,6 +111,8 @@ class Columns:
     """Columns of unknown names; electrodes of other fingers do not count."""
     fingers: tuple[Finger, ...]
     """Fingers that the file has, asked for or not."""
+    finger: tuple[int, str] | None
+    """Place and name of a column that may say of which finger a row is, of electrodes of one."""
 
     @classmethod
     def of(cls, path: Path, names: Sequence[str], fingers: Sequence[str], line: int) -> Columns:
@@ -143,13 +152,23 @@ class Columns:
             slipped=single.get(SLIPPED),
             ignored=tuple(name for place, name in enumerate(names) if place not in known),
             fingers=every,
+            finger=_finger_column(names) if len(every) == 1 else None,
         )
 
 
 def has_electrodes(names: Sequence[str]) -> bool:
-    """Return True for a header with electrodes of some scheme."""
-    plain = [_UNIT.sub("", name) for name in names]
-    return any(scheme.fullmatch(name) for scheme in SCHEMES.values() for name in plain)
+    """Return True for a header with electrodes of some scheme.
+
+    A title may name one, as may a row of a table that has a row for each electrode.
+    """
+    return sum(map(is_electrode, names)) >= HEADER_ELECTRODES_MIN
+
+
+def is_electrode(name: str) -> bool:
+    """Return True for the name of an electrode in some scheme."""
+    plain = _UNIT.sub("", name)
+    matches = (scheme.fullmatch(plain) for scheme in SCHEMES.values())
+    return any(match and int(match["number"]) <= ELECTRODES for match in matches)
 
 
 def with_units(names: Sequence[str], cells: Sequence[str]) -> list[str] | None:
@@ -174,6 +193,9 @@ def _electrodes(
                 number = int(match["number"])
                 _refuse_twice(path, names, line, numbers.get(number), place)
                 numbers[number] = place
+        if not found.keys() <= _PLACES.keys() and (column := _finger_column(names)):
+            problem = f"{example} and so on name no finger, but {column[1]} may: {ONE_ROW}"
+            raise RecordingError(path, problem, line=line)
         if found:
             return _whole(path, example, found, fingers, line)
     if are_numbers(names):
@@ -234,6 +256,11 @@ def _whole(
         finger: {number - base: place for number, place in numbers.items()}
         for finger, numbers in found.items()
     }
+
+
+def _finger_column(names: Sequence[str]) -> tuple[int, str] | None:
+    found = ((place, name) for place, name in enumerate(names) if _OF_A_FINGER.fullmatch(name))
+    return next(found, None)
 
 
 def _written(example: str, finger: str) -> str:

@@ -16,9 +16,10 @@ from typing import BinaryIO, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.biotac import FINGERS
 from graspd.drivers.base import ANGLE_MAX_RAD, RecordingError
 from graspd.drivers.recordings.cells import Cells
-from graspd.drivers.recordings.columns import Columns, TimeColumn
+from graspd.drivers.recordings.columns import ONE_ROW, Columns, TimeColumn
 from graspd.drivers.recordings.kinds import open_recording
 from graspd.drivers.recordings.values import (
     count_of,
@@ -118,6 +119,7 @@ def survey(
     columns = Columns.of(path, cells.names, fingers, cells.header_line)
     rows = _Rows(path, columns, cells)
     rows.refuse_values()
+    rows.refuse_fingers_by_row()
     if rows.is_timed(read_as, rate_hz):
         if rate_hz is not None and read_as is None and columns.time is not None:
             problem = "the rows have times: --rate-hz is for --as stream, which leaves them out"
@@ -131,6 +133,7 @@ def survey(
         repeats = problem_of_sweeps(rows.blocks(), read_as, labelled=rows.are_labelled())
         if repeats is not None:
             raise RecordingError(path, repeats)
+        rows.refuse_fingers_by_row()
         layout = Layout(columns, is_stream=False)
     file.seek(0)
     return replace(layout, has_outcomes=rows.has_outcomes(layout))
@@ -158,6 +161,9 @@ class _Rows:
         self.first = [*first, *islice(self._others, BLOCK_ROWS - 1)]
         self._comma = cells.decimal_comma
         self._electrodes = itemgetter(*columns.electrodes)
+        self._named = set[str]()
+        """Fingers of rows, one more at most than there are."""
+        self._note_fingers(self.first)
 
     def refuse_values(self) -> None:
         """Raise if the values of electrodes are something else than counts."""
@@ -165,6 +171,13 @@ class _Rows:
         problem = problem_with(values, decimal_comma=self._comma)
         if problem is not None:
             raise RecordingError(self.path, problem)
+
+    def refuse_fingers_by_row(self) -> None:
+        """Raise if the rows so far are of several fingers, and would be read as those of one."""
+        if self.columns.finger is not None and 1 < len(self._named) <= len(FINGERS):
+            one, other = sorted(self._named)[:2]
+            problem = f"has rows of {one} and of {other}: {ONE_ROW}"
+            raise RecordingError(self.path, problem, column=self.columns.finger[1])
 
     def refuse_degrees(self) -> None:
         """Raise if a joint has angles that no joint reaches, in radians, in a tenth of the rows."""
@@ -206,6 +219,7 @@ class _Rows:
         """Yield the counts of the whole file, shape (rows, electrodes); a missing one is NaN."""
         rows: Iterable[list[str]] = chain(self.first, self._others)
         while cells := list(islice(rows, BLOCK_ROWS)):
+            self._note_fingers(cells)
             yield self._counts(cells)
 
     def follow_each_other(self) -> bool:
@@ -213,6 +227,11 @@ class _Rows:
         counts = _without_gaps(self._counts(self.first))
         steps = _apart(counts[1:], counts[:-1])
         return 2 * int((steps <= STEP_COUNTS).sum()) > len(steps)
+
+    def _note_fingers(self, rows: Sequence[Sequence[str]]) -> None:
+        if self.columns.finger is not None and len(self._named) <= len(FINGERS):
+            place, _ = self.columns.finger
+            self._named |= set(sorted({row[place] for row in rows})[: len(FINGERS) + 1])
 
     def _counts(self, rows: Sequence[Sequence[str]]) -> NDArray[np.float32]:
         return np.array(

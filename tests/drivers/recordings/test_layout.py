@@ -145,6 +145,39 @@ def test_one_finger_needs_no_name() -> None:
     assert "E1 and so on name no finger, and 3 are asked for" in refusal(content)
 
 
+@pytest.mark.parametrize("name", ["finger", "Sensor_ID", "fingertip"])
+@pytest.mark.parametrize("block", [1, 512])
+def test_rows_of_a_finger_each_are_not_of_one_finger(name: str, block: int) -> None:
+    generator = np.random.default_rng(1)
+    header = ",".join([name, *(f"E{number}" for number in range(1, 25))])
+    rows = [
+        ",".join(
+            ["th" if place // block % 2 else "ff", *map(str, generator.integers(4096, size=24))]
+        )
+        for place in range(2 * block)
+    ]
+    content = "\n".join([header, *rows, ""])
+    said = refusal(content.encode(), ["ff"])
+    assert f"column {name}: has rows of ff and of th: put all" in said
+    said = refusal(content.encode())
+    assert f"name no finger, but {name} may: put all fingers into one row" in said
+    of_one = content.replace("th,", "ff,").encode()
+    assert len(rows_of(of_one, ["ff"])) == 2 * block
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"object,slipped,electrode,count\nmug,0,ff_biotac_1,2795\nmug,0,ff_biotac_2,2796\n",
+        b'object,slipped,ff,mf\nmug,0,"[3267, 3249, 9]","[3267, 3249, 8]"\n',
+        b"@relation grasps\n@attribute ff_biotac_1 numeric\n@attribute ff_biotac_2 numeric\n",
+    ],
+    ids=["a row for each electrode", "lists", "ARFF"],
+)
+def test_a_row_with_an_electrode_is_not_a_header(content: bytes) -> None:
+    assert "line 1: no column of electrodes is known" in refusal(content)
+
+
 @pytest.mark.parametrize(
     ("name", "said"),
     [
