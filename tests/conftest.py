@@ -36,7 +36,7 @@ BEGUN_FIRST = (
     "stability/test_models.py",
     "models/training/reports/test_error_vs_time.py",
     "daemon/doctor/test_link_faults.py",
-    "daemon/judge/test_told_grasps.py",
+    "daemon/judge/test_standing.py",
     "daemon/judge/test_every_key.py",
     "daemon/judge/test_grasps_to_the_lift.py",
     "daemon/commands/test_replay_command.py",

@@ -69,10 +69,7 @@ def test_a_one_finger_scene_judges_by_its_own_model(tmp_path: Path) -> None:
     )
     content = json.loads(graspd("check", scene, "--json").stdout)
     assert content["in"]["model"].startswith(f"{name} (")
-    assert "F1 cv " in content["in"]["model"]
     assert f"{', '.join(HANDS[name])} touch" in content["in"]["gate"]
-    left_out = content["left_out"]["fingers"].partition(":")[0].split(", ")
-    assert sorted((*left_out, *HANDS[name])) == ["ff", "lf", "mf", "rf", "th"]
     result = graspd("run", scene)
     assert result.returncode == 0, result.stderr
     assert " readings, 12 judgements: " in result.stderr

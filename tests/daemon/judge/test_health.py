@@ -1,46 +1,64 @@
-"""Health of readings: which electrodes are broken, by hand, and which readings say nothing."""
+"""Health of readings: broken electrodes, what says nothing, and old sweeps that come again."""
 
 from __future__ import annotations
+
+from collections import deque
+from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from graspd.daemon.judge.decision import HandLimits, Limits
 from graspd.daemon.judge.health import Checked, Health
-from graspd.daemon.judge.reasons import Reason
+from graspd.daemon.judge.pipeline import Pipeline
+from graspd.daemon.judge.reasons import Decision, Reason
 from graspd.drivers.base import ElectrodeFault, TactileReading
-from tests.daemon.fakes import sound
+from graspd.drivers.palm.packet import ROUND, PalmPacket
+from graspd.drivers.palm.stream import PalmStream
+from graspd.drivers.twins.datagrams import PalmTwin
+from graspd.drivers.twins.grasps.grasp_script import Durations
+from graspd.drivers.twins.grasps.grasps import recorded_counts
+from graspd.drivers.twins.grasps.whole_grasps import PALM_RATE_HZ, synthetic_grasps
+from graspd.models import zoo
+from graspd.models.runtime import TactileModel
+from tests.daemon.fakes import FINGERS, MS, Clock, sound
+from tests.drivers.one_sweep import tactile
 
-FINGERS = 3
+GRACE = 3
+"""Sweeps after the first turn of a ring from which no verdict may be `stable` any more."""
+UNDER_RING = 30
+"""Sweeps after that."""
+HELD = Durations(first_rest_s=(3.0, 3.0), settle_s=(4.0, 4.0))
 
 
 def broken_of(checked: Checked) -> NDArray[np.bool_]:
     """The broken electrodes, shape (3, 24)."""
-    return np.zeros((FINGERS, 24), np.bool_) if checked.broken is None else checked.broken
+    return np.zeros((3, 24), np.bool_) if checked.broken is None else checked.broken
 
 
 def test_first_low_counts_are_not_a_jump() -> None:
-    health = Health(FINGERS)
-    counts = np.full((FINGERS, 24), 5)
+    health = Health(len(FINGERS))
+    counts = np.full((3, 24), 5)
     for place in range(3):  # two jumps more would be enough
         counts[1, 4] = 3000 - 500 * place
         health.check(sound(counts))
     assert Reason.ELECTRODE_JUMPS not in health.electrodes().values()
 
 
-def watched(steps: NDArray[np.int64]) -> tuple[Health, list[dict[tuple[int, int], Reason]]]:
+def watched(steps: NDArray[np.int64]) -> list[dict[tuple[int, int], Reason]]:
     """What was found in electrodes that go from 2000 by `steps`, shape (sweeps, 24), finger 1.
 
     The electrodes of the other fingers go up and down by more than one that keeps still.
     """
-    health, found = Health(FINGERS), []
+    health, found = Health(len(FINGERS)), []
     for place in range(len(steps) + 1):
-        counts = np.full((FINGERS, 24), 2000 + 31 * (place % 2))
+        counts = np.full((3, 24), 2000 + 31 * (place % 2))
         counts[1] = 2000 + steps[:place].sum(axis=0)
         broken = broken_of(health.check(sound(counts)))
         found.append(health.electrodes())
         assert {(f, e) for f, e in np.argwhere(broken).tolist()} == set(found[-1])
-    return health, found
+    return found
 
 
 def steps_of(sweeps: int, jumps: dict[int, int], movers: int = 1, by: int = 0) -> NDArray[np.int64]:
@@ -67,7 +85,7 @@ def steps_of(sweeps: int, jumps: dict[int, int], movers: int = 1, by: int = 0) -
 def test_more_than_two_jumps_above_a_spike_flag_an_electrode(
     jumps: dict[int, int], jumpy: bool
 ) -> None:
-    _, found = watched(steps_of(max(jumps) + 1, jumps))
+    found = watched(steps_of(max(jumps) + 1, jumps))
     assert [named == {(1, 0): Reason.ELECTRODE_JUMPS} for named in found] == [
         *([False] * (len(found) - 1)),
         jumpy,
@@ -80,7 +98,7 @@ def test_it_jumps_while_the_others_keep_still(movers: int, by: int, jumpy: bool,
     """A touch moves more than four electrodes by more than 30 counts."""
     jumps = {0: 400, 1: -400, 2: 400}
     steps = steps_of(3, {at: sign * jump for at, jump in jumps.items()}, movers, sign * by)
-    _, found = watched(steps)
+    found = watched(steps)
     assert ((1, 0) in found[-1]) == jumpy
 
 
@@ -88,7 +106,7 @@ def test_an_electrode_unchanged_for_16_readings_is_dead() -> None:
     steps = steps_of(40, {})
     steps[:16, 0] = 0
     steps[17:, 5] = 0  # from 17 on
-    _, found = watched(steps)
+    found = watched(steps)
     named = [set(each) for each in found]
     assert named[15] == set()
     assert named[16] == {(1, 0)}
@@ -113,7 +131,7 @@ def test_more_than_twelve_or_eight_broken_electrodes_are_too_many(
     broken: tuple[int, ...], found: bool
 ) -> None:
     railed = np.array([np.arange(24) < number for number in broken])
-    checked = Health(FINGERS).check(sound(np.where(railed, 4095, 2000)))
+    checked = Health(len(FINGERS)).check(sound(np.where(railed, 4095, 2000)))
     assert checked.reasons == ((Reason.SATURATED, Reason.ELECTRODES_BROKEN) if found else ())
 
 
@@ -121,9 +139,9 @@ def test_more_than_twelve_or_eight_broken_electrodes_are_too_many(
     ("count", "railed"), [(0, True), (1, False), (4094, False), (4095, True), (65535, True)]
 )
 def test_rails_are_broken_and_their_neighbours_are_not(count: int, railed: bool) -> None:
-    counts = np.full((FINGERS, 24), 2000)
+    counts = np.full((3, 24), 2000)
     counts[2, 7] = count
-    health = Health(FINGERS)
+    health = Health(len(FINGERS))
     broken = broken_of(health.check(sound(counts)))
     assert broken.sum() == broken[2, 7] == railed
     assert health.electrodes() == ({(2, 7): Reason.SATURATED} if railed else {})
@@ -131,12 +149,12 @@ def test_rails_are_broken_and_their_neighbours_are_not(count: int, railed: bool)
 
 def flat(count: int) -> TactileReading:
     """A reading whose electrodes all read the same."""
-    return sound(np.full((FINGERS, 24), count))
+    return sound(np.full((3, 24), count))
 
 
 @pytest.mark.parametrize("flag", [ElectrodeFault.HELD, ElectrodeFault.CUT_OFF])
 def test_an_unusable_reading_is_remembered_as_an_old_sweep(flag: int) -> None:
-    health, reasons = Health(FINGERS), []
+    health, reasons = Health(len(FINGERS)), []
     for count, bits in [(2000, flag), (2001, 0), (2002, 0), (2000, 0)]:
         reading = flat(count)
         reading.faults[0, 0] = bits
@@ -156,7 +174,7 @@ def test_an_unusable_reading_is_remembered_as_an_old_sweep(flag: int) -> None:
 def test_a_fault_of_more_than_electrodes_refuses_the_reading(
     flags: int, reasons: tuple[Reason, ...]
 ) -> None:
-    health, reading = Health(FINGERS), flat(2000)
+    health, reading = Health(len(FINGERS)), flat(2000)
     reading.faults[2, 23], reading.faults[0, 1] = flags, ElectrodeFault.ERROR_WORD
     found = health.check(reading)
     assert found.reasons == reasons
@@ -164,3 +182,88 @@ def test_a_fault_of_more_than_electrodes_refuses_the_reading(
     # Of two faults of an electrode the first is named; one of no name is not a count.
     named = {16: Reason.HELD, 32: Reason.CUT_OFF}.get(int(flags), Reason.NOT_A_COUNT)
     assert health.electrodes() == {(0, 1): Reason.ERROR_WORD, (2, 23): named}
+
+
+@pytest.mark.parametrize(("sweeps", "live"), [(2, 0), (64, 4), (128, 0), (129, 0)])
+def test_a_ring_of_128_sweeps_is_frozen_from_its_repeat(sweeps: int, live: int) -> None:
+    """The first `live` electrodes differ by one count from turn to turn."""
+    health = Health(len(FINGERS))
+    old = np.random.default_rng(2).integers(500, 3500, (sweeps, 3, 24))
+    for number in range(3 * sweeps):
+        counts = old[number % sweeps].copy()
+        counts[:, :live] += number // sweeps
+        is_frozen = Reason.FROZEN in health.check(sound(counts)).reasons
+        assert is_frozen is (number >= sweeps and sweeps <= 128)
+
+
+@pytest.mark.parametrize("packets", [15, 896])
+def test_a_ring_of_odd_palm_packets_is_never_stable(packets: int) -> None:
+    """Where it restarts a packet is lost, or two contradict each other: a round lacks those."""
+    clock, stream = Clock(), PalmStream(FINGERS)
+    model = TactileModel(zoo.find("cnn1"))
+    pipeline = Pipeline(model, FINGERS, Limits(), clock, hand=HandLimits())
+    moments = synthetic_grasps(1, rate_hz=PALM_RATE_HZ, durations=HELD, seed=0)
+    source = PalmTwin(moment.counts for moment in moments).packets()
+    last: deque[PalmPacket] = deque(maxlen=packets)
+    stable, turning = 0, 0
+    while turning < packets + (GRACE + UNDER_RING) * ROUND:
+        clock.now_ns += MS
+        packet = last[0] if stable >= UNDER_RING else next(source)
+        last.append(packet)
+        turning += stable >= UNDER_RING
+        for reading in tactile(stream.receive(packet.to_bytes(), clock.now_ns) or ()):
+            is_stable = pipeline.judge(reading).decision is Decision.STABLE
+            assert not (is_stable and turning > packets + GRACE * ROUND)
+            stable += is_stable
+    assert stable >= UNDER_RING
+
+
+@pytest.mark.parametrize(("equal", "is_frozen"), [(19, False), (20, True), (23, True)])
+def test_a_sweep_of_twenty_equal_electrodes_comes_again(equal: int, is_frozen: bool) -> None:
+    health, random = Health(len(FINGERS)), np.random.default_rng(4)
+    sweeps = random.integers(500, 3500, (9, 3, 24))
+    sweeps[8, 1] = sweeps[2, 1]
+    sweeps[8, 1, equal:] += 1
+    for counts in sweeps:
+        checked = health.check(sound(counts))
+    assert (Reason.FROZEN in checked.reasons) == is_frozen
+
+
+@pytest.mark.parametrize("faulty", ["always the same", "another each time", "at first", "later"])
+def test_an_electrode_that_is_not_read_hides_no_ring(faulty: str) -> None:
+    """Its count means nothing, however it is flagged."""
+    health, random = Health(len(FINGERS)), np.random.default_rng(1)
+    old = random.integers(500, 3500, (9, 3, 24))
+    said = []
+    for number in range(60):
+        reading = sound(old[number % 9])
+        where = {
+            "always the same": [4],
+            "another each time": random.choice(24, 3, replace=False).tolist(),
+            "at first": [number % 24] if number < 9 else [],
+            "later": [number % 24] if number >= 9 else [],
+        }[faulty]
+        reading.faults[:, where] = ElectrodeFault.PARITY
+        reading.counts[:, where] = random.integers(0, 4096, (3, len(where)))
+        said.append(health.check(reading).reasons)
+    assert all(Reason.FROZEN not in reasons for reasons in said[:9])
+    assert all(Reason.FROZEN in reasons for reasons in said[9:])
+
+
+def test_an_unread_finger_does_not_recur() -> None:
+    health, random = Health(len(FINGERS)), np.random.default_rng(3)
+    for _ in range(300):
+        reading = sound(random.integers(500, 3500, (3, 24)))
+        reading.counts[1], reading.faults[1] = 0, ElectrodeFault.MISSING
+        assert Reason.FROZEN not in health.check(reading).reasons
+
+
+@pytest.mark.parametrize("table", ["palm_45", "palm_down", "palm_side", "untouched"])
+def test_no_real_sweep_comes_again(
+    bts3_dir: Path, untouched: NDArray[np.uint16], table: str
+) -> None:
+    sweeps = untouched if table == "untouched" else recorded_counts(bts3_dir / f"{table}.csv")
+    health = Health(len(FINGERS))
+    found = [Reason.FROZEN in health.check(sound(counts)).reasons for counts in sweeps]
+    assert len(found) > 900
+    assert not any(found)

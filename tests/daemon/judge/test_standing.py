@@ -1,17 +1,20 @@
-"""A verdict that stands says what the network says now, of one grasp, without flickering."""
+"""A verdict stands on all it needs, says what the network says now, and ends with its outcome."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from graspd.daemon.judge.decision import Limits
-from graspd.daemon.judge.pipeline import Pipeline
+from graspd.daemon.judge.decision import HandLimits, Limits
+from graspd.daemon.judge.pipeline import Judgement, Pipeline
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
-from graspd.daemon.trust.lift_book import GraspId
+from graspd.daemon.trust.lift_book import GraspId, OutcomeStatus
 from graspd.daemon.trust.trust import Trust
 from graspd.drivers.base import ElectrodeFault
 from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps
@@ -20,13 +23,37 @@ from graspd.models.judge.session import SessionCalibration
 from graspd.models.runtime import TactileModel
 from graspd.models.trust.risk import RiskLimits
 from tests.daemon.fakes import MS, Clock, sound
-from tests.daemon.judge.felt_hand import HELD, Feel, Flaw, Hand, limits, tared
+from tests.daemon.judge.felt_hand import HELD, Feel, Flaw, Hand, begins, feels, gates, tared
+from tests.daemon.judge.felt_hand import limits as gate_limits
 
 BOOT = "b" * 32
+RISKS = {
+    "nothing learns": None,
+    "no risk": RiskLimits(),
+    "in the warm-up": RiskLimits(0.05, warm_up=50),
+    "a risk with all withheld lifts watched": RiskLimits(0.05, explore=1.0),
+}
+
+
+def trusting(gate: HandLimits, limits: RiskLimits | None) -> Hand:
+    hand = tared(gate)
+    hand.pipeline.boot_id = BOOT
+    if limits is not None:
+        trust = Trust(hand.model.sha256, 0, limits, learns=False)
+        hand.pipeline.trust, hand.pipeline.lifts = trust, trust.lifts
+    return hand
+
+
+def tell(hand: Hand, grasp: int, *, slipped: bool) -> OutcomeStatus:
+    return hand.pipeline.outcome(GraspId(BOOT, grasp), slipped=slipped)
+
+
+def is_offered(said: Judgement) -> bool:
+    return said.decision is Decision.STABLE or said.supervised
 
 
 def test_slip_becomes_stable_only_after_a_second_without() -> None:
-    hand = tared(limits())
+    hand = tared(gate_limits())
     assert hand.play(HELD)[-1].decision is Decision.STABLE
     slips = hand.play(Feel(times=10, answer=0.6))
     assert {each.decision for each in slips[5:]} == {Decision.SLIP}
@@ -38,7 +65,7 @@ def test_slip_becomes_stable_only_after_a_second_without() -> None:
 
 
 def test_a_slip_says_nothing_of_the_next_grasp() -> None:
-    hand = tared(limits())
+    hand = tared(gate_limits())
     hand.play(Feel("faint", times=35, answer=0.9))
     hand.play(Feel("rest", times=15))
     said = hand.play(Feel("faint", times=35))
@@ -48,7 +75,7 @@ def test_a_slip_says_nothing_of_the_next_grasp() -> None:
 
 
 def test_values_that_keep_missing_leave_the_newest_judged() -> None:
-    hand = tared(limits())
+    hand = tared(gate_limits())
     assert hand.play(HELD)[-1].decision is Decision.STABLE
     missing = (Flaw(0, 3, 2, int(ElectrodeFault.MISSING), 0),)
     runs, known = hand.model.runs, 0
@@ -59,15 +86,10 @@ def test_values_that_keep_missing_leave_the_newest_judged() -> None:
     assert hand.model.runs - runs >= 80 * 10 // 110
 
 
-def risky(limit: RiskLimits) -> tuple[Hand, Trust]:
-    hand = tared(limits())
-    trust = Trust(hand.model.sha256, 0, limit, learns=False)
-    hand.pipeline.trust, hand.pipeline.boot_id = trust, BOOT
-    return hand, trust
-
-
 def test_a_grasp_judged_again_under_risk_is_one_lift() -> None:
-    hand, trust = risky(RiskLimits(0.05))
+    hand = trusting(gate_limits(), RiskLimits(0.05))
+    trust = hand.pipeline.trust
+    assert trust is not None
     said = hand.play(Feel(times=300, answer=0.001))
     assert said[-1].decision is Decision.STABLE
     assert trust.report().outstanding == 1
@@ -82,7 +104,9 @@ def test_a_grasp_judged_again_under_risk_is_one_lift() -> None:
 
 
 def test_under_a_risk_waiting_brings_no_lucky_draw() -> None:
-    hand, trust = risky(RiskLimits(0.05))
+    hand = trusting(gate_limits(), RiskLimits(0.05))
+    trust = hand.pipeline.trust
+    assert trust is not None
     theta = 1.0 / (1.0 + math.exp(-trust.risk.threshold))
     said = [
         each
@@ -102,7 +126,7 @@ def test_a_grasp_teaches_the_session_only_when_over(
     taken: list[NDArray[np.generic]] = []
     monkeypatch.setattr(SessionCalibration, "observe", lambda _, counts, slip: taken.append(counts))
     model, clock = TactileModel(zoo.find("small-session")), Clock()
-    judge = Pipeline(model, model.contract.fingers, Limits(), clock, hand=limits())
+    judge = Pipeline(model, model.contract.fingers, Limits(), clock, hand=gate_limits())
     held, judged = 0, []
     grasp = synthetic_grasps(1, seed=1)
     (timetable,) = grasp.timetables()
@@ -117,3 +141,61 @@ def test_a_grasp_teaches_the_session_only_when_over(
     assert held
     assert len(taken) == 1
     np.testing.assert_array_equal(taken[0], judged[0])
+
+
+def test_an_open_hand_is_not_told_to_release_anything() -> None:
+    hand = trusting(gate_limits(), None)
+    hand.play(HELD)
+    tell(hand, 1, slipped=False)
+    (*_, said) = hand.play(Feel("rest", times=40))
+    assert (said.moment.grasp, said.reasons) == (1, (Reason.NO_CONTACT,))
+
+
+def test_the_grasp_after_a_told_one_is_offered() -> None:
+    hand = trusting(gate_limits(), None)
+    hand.play(Feel("faint", times=35))
+    tell(hand, 1, slipped=True)
+    hand.play(Feel("rest", times=15))
+    said = hand.play(Feel("faint", times=35))[-1]
+    assert (said.moment.grasp, said.decision) == (2, Decision.STABLE)
+
+
+def test_an_answer_says_that_its_outcome_is_told() -> None:
+    hand = trusting(gate_limits(on_request=True), RISKS["in the warm-up"])
+    hand.play(HELD)
+    tell(hand, 1, slipped=True)
+    (answer,) = [each for each in hand.play(HELD) if each.moment.judged]
+    assert (answer.decision, answer.supervised) == (Decision.UNKNOWN, False)
+    assert Reason.OUTCOME_TOLD in answer.reasons
+
+
+outcomes = st.sampled_from([None, None, False, True])
+"""Told of the newest grasp before a hand feels what comes next: whether it slipped."""
+
+
+@given(
+    gate=gates,
+    limits=st.sampled_from(list(RISKS.values())),
+    begin=begins,
+    following=st.lists(st.tuples(outcomes, feels), min_size=3, max_size=12),
+)
+@settings(max_examples=100)
+def test_whatever_comes_a_verdict_has_all_it_needs(
+    gate: HandLimits,
+    limits: RiskLimits | None,
+    begin: Sequence[Feel],
+    following: Sequence[tuple[bool | None, Feel]],
+) -> None:
+    hand = trusting(gate, limits)
+    told: set[int] = set()
+    newest = 0
+    for slipped, feel in [*((None, feel) for feel in begin), *following]:
+        if slipped is not None and tell(hand, newest, slipped=slipped) is OutcomeStatus.TAKEN:
+            told.add(newest)
+        for said in hand.play(feel):
+            newest = said.moment.grasp
+            if newest in told:
+                assert not is_offered(said)
+                assert Reason.OUTCOME_TOLD in said.reasons or not said.moment.in_contact
+    if gate.on_request:
+        assert hand.judged <= hand.asked * (2 if gate.gate.early else 1)

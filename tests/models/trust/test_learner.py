@@ -8,11 +8,11 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from graspd.models.trust.learner import Learner, LearnerState, sigmoid
 from tests.models.trust.reference import Reference
-from tests.models.trust.streams import CLIP, Outcome, learn, lifts
+from tests.models.trust.streams import CLIP, learn, lifts
 
 ONE_FINGER, THREE_FINGERS = 26, 78
 
@@ -41,57 +41,39 @@ def test_it_is_the_dense_filter_in_long_double(inputs: int) -> None:
     np.testing.assert_allclose(found_mean, mean.astype(float), rtol=0.0, atol=1e-9)
 
 
-Stream = Callable[[np.random.Generator, int], Iterator[Outcome]]
+def coin(random: np.random.Generator) -> bool:
+    return bool(random.integers(0, 2))
 
 
-def constant(random: np.random.Generator, number: int) -> Iterator[Outcome]:
-    x = np.full(ONE_FINGER, 0.5, np.float32)
-    yield from ((1.0, x, bool(slipped)) for slipped in random.integers(0, 2, number))
+def separable(random: np.random.Generator, _index: int) -> tuple[float, ArrayLike, bool]:
+    slipped = coin(random)
+    return 0.0, [CLIP if slipped else -CLIP] * ONE_FINGER, slipped
 
 
-def at_the_clip(random: np.random.Generator, number: int) -> Iterator[Outcome]:
-    signs = random.choice([-CLIP, CLIP], (number, ONE_FINGER)).astype(np.float32)
-    told = random.integers(0, 2, (number, 2))
-    yield from ((1e9 * (2 * far - 1), x, bool(y)) for x, (far, y) in zip(signs, told, strict=True))
+KINDS: dict[str, Callable[[np.random.Generator, int], tuple[float, ArrayLike, bool]]] = {
+    "always the same": lambda random, _: (1.0, [0.5] * ONE_FINGER, coin(random)),
+    "at the clip": lambda random, _: (
+        random.choice((-1e9, 1e9)),
+        random.choice((-CLIP, CLIP), ONE_FINGER),
+        coin(random),
+    ),
+    "contradicting": lambda _, at: (5.0, np.linspace(-CLIP, CLIP, ONE_FINGER), at % 2 == 0),
+    "separable": separable,
+    "against the margin": lambda _, at: (-30.0, CLIP * np.eye(26)[at % ONE_FINGER], True),
+    "all in turns": lambda random, at: list(KINDS.values())[at // 100 % 5](random, at),
+}
+"""Margin, inputs and outcome of a lift, by its number."""
 
 
-def contradicting(random: np.random.Generator, number: int) -> Iterator[Outcome]:
-    x = np.linspace(-CLIP, CLIP, ONE_FINGER, dtype=np.float32)
-    yield from ((5.0, x, index % 2 == 0) for index in range(number))
-
-
-def separable(random: np.random.Generator, number: int) -> Iterator[Outcome]:
-    x = np.full(ONE_FINGER, CLIP, np.float32)
-    yield from (
-        (0.0, x if slipped else -x, bool(slipped)) for slipped in random.random(number) < 0.5
-    )
-
-
-def against_the_margin(random: np.random.Generator, number: int) -> Iterator[Outcome]:
-    units = CLIP * np.eye(ONE_FINGER, dtype=np.float32)
-    yield from ((-30.0, units[index % ONE_FINGER], True) for index in range(number))
-
-
-def all_in_turns(random: np.random.Generator, number: int) -> Iterator[Outcome]:
-    for _ in range(number // 500):
-        for kind in KINDS:
-            yield from kind(random, 100)
-
-
-KINDS: tuple[Stream, ...] = (constant, at_the_clip, contradicting, separable, against_the_margin)
-
-
-@pytest.mark.parametrize(
-    ("kind", "number"), [*((kind, 500) for kind in KINDS), (all_in_turns, 2500)]
-)
-def test_whatever_it_is_told_it_stays_bounded_and_positive_definite(
-    kind: Stream, number: int
-) -> None:
+@pytest.mark.parametrize("kind", KINDS)
+def test_whatever_it_is_told_it_stays_bounded_and_positive_definite(kind: str) -> None:
+    random, number = np.random.default_rng(0), 2500 if kind == "all in turns" else 500
     learner = Learner(ONE_FINGER)
     weights_prior = [0.5**2, 0.5**2] + [0.2**2] * ONE_FINGER
-    for index, (margin, x, slipped) in enumerate(kind(np.random.default_rng(0), number), 1):
-        learner.learn(learner.judge(margin, x)[1], slipped=slipped)
-        if index % (number // 50) == 0:
+    for index in range(number):
+        margin, inputs, slipped = KINDS[kind](random, index)
+        learner.learn(learner.judge(margin, np.asarray(inputs))[1], slipped=slipped)
+        if (index + 1) % (number // 50) == 0:
             mean, matrix = learner.at_told()
             prior = np.array(weights_prior + [9.009] * (len(mean) - len(weights_prior)))
             np.testing.assert_array_equal(matrix, matrix.T)
@@ -158,19 +140,6 @@ def test_one_lie_turns_few_unlike_slips_stable(true_outcomes: int) -> None:
         unlike = (alike < 0.1) & slips[true_outcomes:]
         turned.append((after <= 0.0)[unlike & (before > 0.0)].mean())
     assert max(turned) < 0.1
-
-
-@pytest.mark.parametrize("inputs", [26, 52, 78])
-def test_a_restored_learner_continues_bit_for_bit(inputs: int) -> None:
-    whole, first, second = Learner(inputs), Learner(inputs), Learner(inputs)
-    stream = list(lifts(80, inputs))
-    learn(whole, iter(stream))
-    learn(first, iter(stream[:33]))
-    state = first.state()
-    learn(first, iter(stream[:5]))  # what it learns later is not in the state
-    second.restore(state)
-    learn(second, iter(stream[33:]))
-    assert second.state() == whole.state()
 
 
 def spoilt(state: LearnerState) -> Iterator[tuple[str, LearnerState]]:

@@ -1,10 +1,9 @@
-"""The residual against scikit-learn's Gaussian processes, and against a dense long double."""
+"""The residual: its kernel is scikit-learn's, its learning that of a dense one in long double."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
 from graspd.models.trust import learner as learner_module
@@ -23,33 +22,12 @@ def grasps(number: int) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
     return 0.3 * np.random.default_rng(1).normal(size=(number, INPUTS))
 
 
-def process() -> GaussianProcessRegressor:
-    """The same prior; no parameter is fitted."""
-    kernel = ConstantKernel(SHARED) * RBF(LENGTH) + WhiteKernel(OWN)
-    return GaussianProcessRegressor(kernel, alpha=0.0, optimizer=None)
-
-
 def test_the_prior_is_scikit_learns_kernel() -> None:
-    told = grasps(40)
-    expected = process().kernel(told)
+    told, shared = grasps(40), ConstantKernel(SHARED) * RBF(LENGTH)
+    expected = (shared + WhiteKernel(OWN))(told)
     np.testing.assert_allclose(Residual(told).prior, expected, rtol=1e-12)
-    apart = (ConstantKernel(SHARED) * RBF(LENGTH))(told[:5], told)
+    apart = shared(told[:5], told)
     np.testing.assert_allclose([Residual(told).shared(x) for x in told[:5]], apart, rtol=1e-12)
-
-
-def test_a_new_grasp_is_judged_as_by_a_gaussian_process() -> None:
-    told, new = grasps(30)[:-1], grasps(30)[-1]
-    values = np.sin(told).sum(axis=1)
-    expected = process().fit(told, values)
-    right, variance = expected.predict(new[None], return_cov=True)
-    certain = np.zeros((len(told), len(told)))
-    residual = Residual(told)
-    mean, spread = residual.from_others(values, certain)
-    residual.add(new)
-    means, covariance = residual.at_told(np.append(mean, 0.0), np.pad(spread, (0, 1)))
-    np.testing.assert_array_equal(residual.grasps, grasps(30))
-    np.testing.assert_allclose(means, [*values, right[0]], rtol=1e-9)
-    assert covariance[-1, -1] == pytest.approx(variance[0, 0], rel=1e-9)
 
 
 @pytest.mark.parametrize(("kept", "spread"), [(128, 0.5), (7, 0.5), (7, 1e-6), (7, 100.0)])
