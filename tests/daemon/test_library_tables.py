@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 import graspd
 from graspd.daemon.session.file import SessionFileError
-from graspd.drivers.recordings.csv_player import DEMO_DAY, DEMO_RECORDING
+from graspd.drivers.recordings.csv_player import DEMO_RECORDING
 from graspd.models.contract import ModelError
 from tests.daemon.test_library import GIVEN, columns, messages
 
@@ -48,19 +48,6 @@ def test_a_table_is_judged_as_its_file(
     ]
     assert {each[0] for each in told[0]} >= {"stable", "slip"}
     assert told[0] == told[1]
-
-
-@pytest.mark.filterwarnings("ignore:of 300 grasps 177 were not judged")
-def test_what_the_readers_return_is_judged_as_its_file() -> None:
-    pytest.importorskip("pandas", reason="needs the extra `pandas`")
-    frame = graspd.read_grasps(DEMO_DAY)
-    numbered = frame.assign(object="#1")  # begins no comment
-    told = [
-        [(each.verdict, each.p_slip) for each in graspd.judge(given, model="mlp")]
-        for given in (DEMO_DAY, frame, numbered)
-    ]
-    assert len(told[0]) == 300
-    assert told[0] == told[1] == told[2]
 
 
 TIMES: dict[str, Callable[[NDArray[np.float64]], Any]] = {

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import csv
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
 from graspd.daemon.publish.messages import Verdict
-from graspd.drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
+from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from tests.kit.inside import graspd
 from tests.kit.messages import decode_verdict
 
@@ -56,20 +55,3 @@ def test_a_table_without_a_finger_of_the_model_is_refused(tmp_path: Path) -> Non
     result = graspd("replay", cut(DEMO_TABLE, ("ff", "th"), tmp_path))
     assert result.returncode == 2
     assert "has ff, th; small-session also needs mf" in result.stderr
-
-
-def test_a_one_finger_scene_judges_by_its_own_model(tmp_path: Path) -> None:
-    name = "small-session-th"
-    recording = cut(DEMO_RECORDING, HANDS[name], tmp_path)
-    scene = tmp_path / "scene.toml"
-    scene.write_text(
-        f"[hand]\nfingers = {json.dumps(HANDS[name])}\n"
-        f'[tactile]\ndriver = "replay"\npace = "fast"\nrecordings = ["{recording}"]\n'
-        f'[publish]\nendpoint = "ipc://{tmp_path}/graspd"\n'
-    )
-    content = json.loads(graspd("check", scene, "--json").stdout)
-    assert content["in"]["model"].startswith(f"{name} (")
-    assert f"{', '.join(HANDS[name])} touch" in content["in"]["gate"]
-    result = graspd("run", scene)
-    assert result.returncode == 0, result.stderr
-    assert " readings, 12 judgements: " in result.stderr

@@ -103,14 +103,15 @@ def test_long_lost_electrodes_stay_unknown_for_a_window() -> None:
     known = []
     for index in range(300):
         usable, sweep = FINGER.copy(), counts[index].copy()
-        if index in (120, 123, *range(150, 153), *range(200, 204)):
-            usable[0, :13] = False
-            sweep[0, :13] = 4095
+        if index in (120, 123, *range(150, 153), *range(160, 164), *range(200, 204)):
+            lost = 12 if 160 <= index < 164 else 13
+            usable[0, :lost] = False
+            sweep[0, :lost] = 4095
         motion.add(index * 10_000_000, sweep, None if usable.all() else usable)
         known.append(tuple(np.isfinite((motion.fast[0], motion.slow[0])).tolist()))
         assert not known[-1][1] or motion.slow[0] < 1.5
-    # Three sweeps in a row are bridged, a fourth is not: eleven electrodes are too few to know that
-    # a finger is still, for as long as a window goes back to it.
+    # Three sweeps in a row are bridged, a fourth is not: eleven electrodes, not twelve, are too few
+    # to know that a finger is still, for as long as a window goes back to it.
     assert set(known[110:203]) == {(True, True)}
     assert known[203:] == [(False, False)] * 10 + [(True, False)] * 14 + [(True, True)] * 73
 
@@ -137,11 +138,6 @@ def test_the_noise_of_an_electrode_counts_until_it_is_lost() -> None:
 def test_no_such_share_of_false_alarms_is_accepted(share: float) -> None:
     with pytest.raises(ValueError, match="false_alarms"):
         Motion(3, share)
-
-
-def test_nearly_half_of_the_sweeps_may_be_false_alarms() -> None:
-    strict = Motion(3, 0.49).strict
-    assert (strict.fast, strict.early, strict.sure) == ([1.0] * 3, False, False), "nothing is known"
 
 
 def test_a_slow_line_has_three_sweeps_and_one_before() -> None:

@@ -86,23 +86,6 @@ def test_values_that_keep_missing_leave_the_newest_judged() -> None:
     assert hand.model.runs - runs >= 80 * 10 // 110
 
 
-def test_a_grasp_judged_again_under_risk_is_one_lift() -> None:
-    hand = trusting(gate_limits(), RiskLimits(0.05))
-    trust = hand.pipeline.trust
-    assert trust is not None
-    said = hand.play(Feel(times=300, answer=0.001))
-    assert said[-1].decision is Decision.STABLE
-    assert trust.report().outstanding == 1
-    (record,) = trust.lifts.state().records
-    first = record.features
-    hand.play(Feel(times=300, answer=0.002))
-    assert trust.lifts.state().records[0].features == first, "what it was called stable by"
-    hand.play(Feel(times=50, answer=0.9))
-    assert trust.lifts.is_stable(GraspId(BOOT, 1)), "it may have been lifted on that"
-    hand.pipeline.outcome(GraspId(BOOT, 1), slipped=True)
-    assert (trust.risk.lifts, trust.risk.slips) == (1, 1)
-
-
 def test_under_a_risk_waiting_brings_no_lucky_draw() -> None:
     hand = trusting(gate_limits(), RiskLimits(0.05))
     trust = hand.pipeline.trust

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import numpy as np
-import pytest
-from msgspec.structs import replace
-
 from graspd.daemon.judge.pipeline import Judgement, Pipeline
 from graspd.daemon.judge.reasons import Decision, Reason
 from graspd.daemon.trust.lift_book import GraspId
 from graspd.daemon.trust.trust import Trust
 from graspd.drivers.base import ElectrodeFault
-from graspd.models.trust.risk import Permission, RiskLimits
+from graspd.models.trust.risk import RiskLimits
 from tests.daemon.fakes import Clock, FakeModel, pipeline, reading
 
 BOOT = "b" * 32
-NONE = np.empty(0, np.float32)
 
 
 def trusting(
@@ -91,25 +86,3 @@ def test_when_too_many_slipped_nothing_is_stable_any_more() -> None:
     assert judgement.decision is Decision.UNKNOWN
     assert judgement.reasons == (Reason.RISK_EXCEEDED,)
     assert not judgement.supervised
-
-
-def test_what_was_permitted_and_not_said_is_asked_again() -> None:
-    trust = Trust("model", 0, RiskLimits(0.05), learns=False)
-    grasps = [GraspId(BOOT, number) for number in range(30)]
-    early = [trust.judge(grasp, 1e-6, -13.8, NONE) for grasp in grasps]
-    assert {each.permission for each in early} == {Permission.ALLOWED}
-    slips = 0
-    for grasp, assessment in zip(grasps, early, strict=True):
-        if trust.review(grasp, assessment).permission is Permission.ALLOWED:
-            trust.note(grasp, assessment, stable=True)
-            trust.outcome(grasp, slipped=True)
-            slips += 1
-    assert 0 < slips <= 0.05 * slips + 5.0
-
-
-@pytest.mark.parametrize("permission", sorted(set(Permission) - {Permission.ALLOWED}), ids=str)
-def test_a_grasp_that_was_not_allowed_stays_so(permission: Permission) -> None:
-    trust, grasp = Trust("model", 0, RiskLimits(0.05), learns=False), GraspId(BOOT, 1)
-    allowed = trust.judge(grasp, 1e-6, -13.8, NONE)
-    assert trust.review(grasp, allowed).permission is Permission.ALLOWED
-    assert trust.review(grasp, replace(allowed, permission=permission)).permission is permission

@@ -9,12 +9,13 @@ import zlib
 import msgspec
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from graspd.daemon.trust.lift_book import LIFTS_MAX, OutcomeStatus
-from graspd.daemon.trust.trust import DIGEST_BYTES, MAX_BYTES, Trust, TrustState, decode, encode
+from graspd.daemon.trust.trust import DIGEST_BYTES, Trust, TrustState, decode, encode
 from graspd.models.trust.learner import sigmoid
 from graspd.models.trust.residual import GRASPS_MAX
-from graspd.models.trust.risk import RiskLimits
+from graspd.models.trust.risk import Permission, RiskLimits
 from tests.daemon.trust.grasps import INPUTS, RULE, inputs, judge, named, trust
 
 
@@ -56,6 +57,26 @@ def test_stable_cannot_be_noted_where_it_was_not_allowed() -> None:
             part.note(named(0), assessment, stable=True)
 
 
+def test_what_was_permitted_and_not_said_is_asked_again() -> None:
+    part, names = trust(RiskLimits(0.05)), list(map(named, range(30)))
+    early = [part.judge(name, 1e-6, -13.8, inputs(0)) for name in names]
+    assert {each.permission for each in early} == {Permission.ALLOWED}
+    slips = 0
+    for name, assessment in zip(names, early, strict=True):
+        if part.review(name, assessment).permission is Permission.ALLOWED:
+            part.note(name, assessment, stable=True)
+            part.outcome(name, slipped=True)
+            slips += 1
+    assert 0 < slips <= 0.05 * slips + 5.0
+
+
+@pytest.mark.parametrize("permission", Permission, ids=str)
+def test_a_grasp_that_was_not_allowed_stays_so(permission: Permission) -> None:
+    part = trust()
+    former = replace(part.judge(named(1), 1e-6, -13.8, inputs(1)), permission=permission)
+    assert part.review(named(1), former).permission is permission
+
+
 @pytest.mark.parametrize(
     ("p", "margin", "says"),
     [
@@ -89,7 +110,7 @@ def test_the_largest_state_of_three_fingers_fits() -> None:
         if grasp < GRASPS_MAX:
             part.outcome(named(grasp), slipped=False)
     data = encode(part.state())
-    assert 600_000 < len(msgspec.msgpack.encode(part.state())) < 0.75 * MAX_BYTES
+    assert 600_000 < len(msgspec.msgpack.encode(part.state())) < 0.75 * (1 << 20)
     other = Trust("f" * 64, 78, RULE)
     other.restore(decode(data))
     assert encode(other.state()) == data
@@ -110,7 +131,7 @@ def test_no_damaged_byte_goes_unnoticed() -> None:
         damaged[place] ^= 0x10
         with pytest.raises(ValueError, match="damaged"):
             decode(bytes(damaged))
-    long = bytes(MAX_BYTES)
+    long = bytes(1 << 20)
     for bad in (b"", data[:-1], data[:20], data + b"\0", hashlib.sha256(long).digest() + long):
         with pytest.raises(ValueError, match="damaged"):
             decode(bad)
@@ -118,7 +139,7 @@ def test_no_damaged_byte_goes_unnoticed() -> None:
 
 def too_many() -> bytes:
     """A state of one record more than is remembered."""
-    state, replace = full().state(), msgspec.structs.replace
+    state = full().state()
     many = tuple(replace(state.lifts.records[0], id=named(n)) for n in range(LIFTS_MAX + 1))
     return encode(replace(state, lifts=replace(state.lifts, records=many)))[DIGEST_BYTES:]
 
@@ -149,8 +170,8 @@ def test_a_state_of_format_2_teaches_the_same() -> None:
     part, later = full(), trust()
     state = part.state()
     mean, covariance = (each.tobytes() for each in part.learner.at_told())
-    learner = msgspec.structs.replace(state.learner, mean=mean, covariance=covariance)
-    later.restore(decode(encode(msgspec.structs.replace(state, version=2, learner=learner))))
+    learner = replace(state.learner, mean=mean, covariance=covariance)
+    later.restore(decode(encode(replace(state, version=2, learner=learner))))
     assert p_slip(later) == pytest.approx(p_slip(part), abs=1e-9)
 
 
@@ -160,7 +181,6 @@ def test_a_state_of_something_else_is_refused_and_changes_nothing() -> None:
     state = part.state()
     records = state.lifts.records
     unlearned = next(record for record in records if record.slipped is None)
-    replace = msgspec.structs.replace
 
     def with_records(*chosen: object) -> TrustState:
         return replace(state, lifts=replace(state.lifts, records=chosen))
