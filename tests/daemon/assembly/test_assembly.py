@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import re
 import tomllib
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, cast
 
@@ -13,7 +12,6 @@ import pytest
 from msgspec.structs import replace
 
 from graspd.daemon.assembly import assembly
-from graspd.daemon.assembly.parts import Assembly, Parts
 from graspd.daemon.assembly.plan import Plan
 from graspd.daemon.assembly.sources import Tables
 from graspd.daemon.judge.reasons import Decision, Reason
@@ -158,19 +156,6 @@ def test_fingers_in_another_order_are_told_what_to_write_instead(
     as_written = hand(("ff", "th"), tactile | wanted.get("tactile", {}))
     assembly.build_pipeline(Plan.of(as_written), assembly.load_model(as_written))
     assert (tactile | wanted.get("tactile", {})).get("sensors") == sensors
-
-
-def test_a_grasp_has_the_boot_id_of_its_own_start() -> None:
-    scene = scene_of(REPLAY)
-    parts = Parts.of(Plan.of(scene), assembly.load_model(scene))
-    named = []
-    for _ in range(2):
-        with ExitStack() as stack:
-            outbox = Assembly(parts, stack).build_outbox()
-        judgement = parts.pipeline.silence(0)
-        named.append(outbox.verdict(judgement, 0, 1)[0].boot_id)
-        assert parts.pipeline.boot_id == named[-1]
-    assert named[0] != named[1]
 
 
 class Constructed:

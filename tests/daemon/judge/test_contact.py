@@ -340,19 +340,6 @@ def test_three_electrodes_24_counts_lower_are_a_touch(untouched: Counts) -> None
     assert touching[500:550].any(axis=0).all()
 
 
-@pytest.mark.parametrize(("electrodes", "sweeps"), [(1, 50), (2, 2)])
-def test_spikes_of_one_or_two_electrodes_never_make_a_touch(
-    untouched: Counts, electrodes: int, sweeps: int
-) -> None:
-    random = np.random.default_rng(7)
-    spiked = untouched.astype(np.int64)
-    for start in range(100, 900, sweeps + 10):
-        for finger in range(3):
-            where = random.choice(24, electrodes, replace=False)
-            spiked[start : start + sweeps, finger, where] -= 150
-    assert not Hand().play(as_sampled(untouched, spiked)).any()
-
-
 @pytest.mark.parametrize(("held_s", "drift"), [(30, 0.0), (300, 0.7)])
 def test_a_hand_that_opens_after_a_long_hold_touches_nothing(held_s: int, drift: float) -> None:
     hand = Hand()

@@ -157,15 +157,6 @@ SCENARIOS = [
         settled_s=(1.03, 1.05),
     ),
     Scenario(
-        # The joint stops at 0.6 s; a window of 80 ms at 0.5 rad/s fades below 0.1 rad/s in 64 ms.
-        "joints moving",
-        GRASPED,
-        UP,
-        joint=lambda t_s: 0.7 + 0.5 * min(t_s, 0.6),
-        limits=JOINTS,
-        settled_s=(0.66, 0.69),
-    ),
-    Scenario(
         # By hand: silent since 0 s, lost after 1 s; the fingers have kept still for long.
         "joints lost",
         GRASPED,
