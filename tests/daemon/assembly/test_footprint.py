@@ -5,12 +5,11 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.bench.footprint import Footprint, measure
+from tests.bench.footprint import measure
 from tests.kit.scenes import demo_scene
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
@@ -87,26 +86,14 @@ FILE = 1
 """The recording that plays, or the lock of the kept session."""
 
 
-@pytest.fixture(scope="module")
-def measured() -> Iterator[Callable[[Path], Footprint]]:
-    """Measures a scene once, without the threads that libraries start by the machine's cores.
+@pytest.fixture(autouse=True)
+def as_everywhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out the threads that libraries start by the machine's cores.
 
     Of onnxruntime's telemetry, on by default from 1.29 on and off in CI, nothing is counted.
     """
-    found: dict[Path, Footprint] = {}
-
-    def once(scene: Path) -> Footprint:
-        if scene not in found:
-            found[scene] = measure(scene)
-        return found[scene]
-
-    with pytest.MonkeyPatch.context() as patch:
-        for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "ORT_DISABLE_TELEMETRY"):
-            patch.setenv(name, "1")
-        yield once
-
-
-Measured = Callable[[Path], Footprint]
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "ORT_DISABLE_TELEMETRY"):
+        monkeypatch.setenv(name, "1")
 
 
 def below(names: set[str], modules: tuple[str, ...]) -> list[str]:
@@ -115,8 +102,8 @@ def below(names: set[str], modules: tuple[str, ...]) -> list[str]:
 
 
 @pytest.mark.parametrize("scene", SCENES, ids=lambda path: path.stem)
-def test_an_example_scene_costs_only_what_it_needs(scene: Path, measured: Measured) -> None:
-    cost = measured(scene)
+def test_an_example_scene_costs_only_what_it_needs(scene: Path) -> None:
+    cost = measure(scene)
     assert below(NEVER | FORBIDDEN[scene.stem], cost["modules"]) == []
     assert BUSES[DRIVER.get(scene.stem, scene.stem)] <= set(cost["modules"])
     commands = [name for name in cost["modules"] if name.startswith("graspd.daemon.commands.")]
@@ -131,8 +118,8 @@ def test_an_example_scene_costs_only_what_it_needs(scene: Path, measured: Measur
     assert 5 <= len(cost["judged"]) <= 4 + 60
 
 
-def test_a_table_of_grasps_has_neither_gate_nor_joints(tmp_path: Path, measured: Measured) -> None:
-    found = measured(demo_scene(tmp_path))
+def test_a_table_of_grasps_has_neither_gate_nor_joints(tmp_path: Path) -> None:
+    found = measure(demo_scene(tmp_path))
     assert below(GATE | JOINTS | HALL | KEPT | ASK, found["modules"]) == []
     assert len(found["judged"]) == len(found["reading"])
 

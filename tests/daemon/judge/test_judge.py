@@ -118,13 +118,3 @@ def test_silence_is_stale() -> None:
     assert judgement.decision is Decision.UNKNOWN
     assert judgement.reasons == (Reason.STALE,)
     assert judgement.t_ns == 5
-
-
-def test_a_wholly_flagged_finger_is_missing_not_frozen() -> None:
-    clock = Clock()
-    judge = pipeline(FakeModel(), clock)
-    for number in range(3):
-        bad = reading(clock(), number)
-        bad.counts[1] = 0
-        bad.faults[1] = ElectrodeFault.MISSING
-        assert judge.judge(bad).reasons == (Reason.SENSOR_MISSING, Reason.ELECTRODES_BROKEN)
