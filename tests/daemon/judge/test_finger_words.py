@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from itertools import pairwise
 
 import pytest
@@ -31,27 +33,36 @@ SLIPPING = Scenario(
     "",
     seconds=2.5,
 )
-Feelings = dict[Finger, FingerState | None]
+Told = list[tuple[float, GateState | None, dict[Finger, FingerState | None]]]
+"""Time, s, state of the gate and words of each reading."""
+SOUND = Checked((), None)
 
 
-def felt(scenario: Scenario, hand: HandTracker) -> list[tuple[float, GateState | None, Feelings]]:
-    """Time, s, state of the gate and words of each reading."""
-    told = []
+def felt(
+    scenario: Scenario,
+    restart_s: float = math.inf,
+    check: Callable[[float], Checked] = lambda _t_s: SOUND,
+) -> Told:
+    """What is told while a hand feels this; at `restart_s` something interrupts it."""
+    hand, told = HandTracker(FINGERS, LIMITS), Told()
     for t_s, reading in readings(scenario):
-        moment, _ = hand.step(reading.made_ns, reading.counts, Checked((), None))
+        if abs(t_s - restart_s) < 1e-6:
+            hand.restart()
+        moment, _ = hand.step(reading.made_ns, reading.counts, check(t_s))
         assert moment.fingers is not None
         told.append((t_s, moment.state, dict(moment.fingers)))
+    assert hand.silent().fingers == UNKNOWN, "nothing is told without a reading"
     return told
 
 
-def words(told: list[tuple[float, GateState | None, Feelings]], finger: Finger) -> list[str]:
+def words(told: Told, finger: Finger) -> list[str]:
     """Words of a finger, each one once, in their order."""
     said = [feelings[finger] or "unknown" for _, _, feelings in told]
     return [said[0], *(word for former, word in pairwise(said) if word != former)]
 
 
 def test_the_words_follow_a_grasp_from_rest_to_release() -> None:
-    told = felt(SLIPPING, HandTracker(FINGERS, LIMITS))
+    told = felt(SLIPPING)
     assert words(told, "ff") == ["unknown", "free", "slide", "touch", "slide", "touch"]
     assert words(told, "mf") == ["unknown", "free", "slide", "touch"]
     assert words(told, "th") == ["unknown", "free", "slide", "touch", "slide", "free"]
@@ -73,48 +84,28 @@ def test_motion_of_a_still_finger_must_last() -> None:
 
 
 def test_a_word_is_told_once_both_windows_are_known() -> None:
-    hand, sweeps = HandTracker(FINGERS, LIMITS), readings(FIRM)
-    known = []
-    for t_s, reading in sweeps:
-        if abs(t_s - 1.0) < 1e-6:
-            hand.restart()
-        moment, _ = hand.step(reading.made_ns, reading.counts, Checked((), None))
-        if t_s > 1.0 - 1e-6:
-            known.append(moment.fingers)
+    known = [feelings for t_s, _, feelings in felt(FIRM, restart_s=1.0) if t_s > 1.0 - 1e-6]
     # The long window is full by the 25th sweep.
     assert known == [UNKNOWN] * 24 + [HELD] * (len(known) - 24)
 
 
 def test_fast_motion_is_told_before_the_long_window_is_known() -> None:
-    hand = HandTracker(FINGERS, LIMITS)
-    for t_s, reading in readings(SLIPPING):
-        if abs(t_s - 2.15) < 1e-6:
-            hand.restart()
-        moment, _ = hand.step(reading.made_ns, reading.counts, Checked((), None))
-        if t_s > 2.28:
-            break
-    assert moment.fingers == {"ff": None, "mf": None, "th": SLIDE}
+    told = [feelings for t_s, _, feelings in felt(SLIPPING, restart_s=2.15) if t_s < 2.295]
+    assert told[-1] == {"ff": None, "mf": None, "th": SLIDE}
 
 
 @pytest.mark.parametrize("reason", [Reason.SENSOR_MISSING, Reason.FROZEN, Reason.PARITY])
 def test_a_reading_that_cannot_be_used_tells_nothing(reason: Reason) -> None:
-    hand, told = HandTracker(FINGERS, LIMITS), []
-    for number, (_, reading) in enumerate(readings(FIRM)):
-        reasons = (reason,) if number == 230 else ()
-        moment, _ = hand.step(reading.made_ns, reading.counts, Checked(reasons, None))
-        told.append(moment.fingers)
-    assert told[229:232] == [HELD, UNKNOWN, HELD]
-    assert hand.silent().fingers == UNKNOWN, "and nothing is told without a reading"
+    told = felt(FIRM, check=lambda t_s: Checked((reason,) * (abs(t_s - 1.2) < 1e-6), None))
+    around = [feelings for t_s, _, feelings in told if abs(t_s - 1.2) < 0.015]
+    assert around == [HELD, UNKNOWN, HELD]
 
 
 def test_a_finger_of_few_electrodes_hides_no_other() -> None:
-    hand = HandTracker(FINGERS, LIMITS)
     lost = ~ALL
     lost[1, :13] = True
-    for t_s, reading in readings(FIRM):
-        broken = lost if t_s > 1.0 else None
-        moment, _ = hand.step(reading.made_ns, reading.counts, Checked((), broken))
-    assert moment.fingers == {"ff": TOUCH, "mf": None, "th": TOUCH}
+    told = felt(FIRM, check=lambda t_s: Checked((), lost if t_s > 1.0 else None))
+    assert told[-1][2] == {"ff": TOUCH, "mf": None, "th": TOUCH}
 
 
 @pytest.mark.parametrize(("late_ms", "is_known"), [(100, True), (101, False)])
