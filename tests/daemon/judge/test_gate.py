@@ -14,7 +14,7 @@ from graspd.daemon.judge import phase
 from graspd.daemon.judge.decision import GateLimits, HandLimits
 from graspd.daemon.judge.hand import HandTracker
 from graspd.daemon.judge.health import Checked
-from graspd.daemon.judge.reasons import GateChange, GateState, Reason
+from graspd.daemon.judge.reasons import GateState, Moment, Reason
 from graspd.daemon.judge.stillness import Motion
 from graspd.drivers.base import JointReading, TactileReading
 from tests.conftest import ROOT
@@ -48,8 +48,8 @@ class Scenario:
     unusable: tuple[float, float] = (0.0, 0.0)
     """From when to when readings come that cannot be used, s."""
     missing: tuple[float, float] = (0.0, 0.0)
-    joint: Callable[[float], float | None] | None = None
-    """Angle of a joint by time, rad; None where nothing is sent."""
+    joints_until_s: float = -math.inf
+    """For how long still joints send their angles, s."""
     retime: Callable[[float], float] = lambda t_s: t_s
     """Which time a reading bears."""
     limits: HandLimits = LIMITS
@@ -60,14 +60,13 @@ class Played:
     """What came of a scenario."""
 
     hand: HandTracker
-    changes: list[GateChange] = field(default_factory=list)
+    told: list[tuple[float, Moment, NDArray[np.uint16] | None]] = field(default_factory=list)
+    """Time, s, where in a grasp it was, and what was to be judged."""
 
     @property
     def story(self) -> str:
-        return " ".join(f"{change.state}:{change.cause}" for change in self.changes)
-
-    def first_s(self, state: GateState) -> float:
-        return min(c.t_ns for c in self.changes if c.state is state) / 1e9 - START_NS / 1e9
+        changes = (change for _, moment, _ in self.told for change in moment.changes)
+        return " ".join(f"{change.state}:{change.cause}" for change in changes)
 
 
 def depths(scenario: Scenario, t_s: float) -> NDArray[np.float64]:
@@ -94,23 +93,23 @@ def readings(scenario: Scenario) -> list[tuple[float, TactileReading]]:
     return made
 
 
-def play(scenario: Scenario) -> Played:
-    """Feed a hand as the pipeline does."""
+def play(scenario: Scenario, interrupt_s: float = math.inf) -> Played:
+    """Feed a hand as the pipeline does; before that of `interrupt_s` readings are left out."""
     played = Played(HandTracker(FINGERS, scenario.limits))
     hand = played.hand
     for t_s, reading in readings(scenario):
-        angle = None if scenario.joint is None else scenario.joint(t_s)
-        if angle is not None:
-            hand.observe_joints(
-                JointReading(reading.t_ns, 0, ("FFJ3", "THJ1"), np.array([angle, 0.4 + t_s / 1e9]))
-            )
+        if t_s <= scenario.joints_until_s:
+            angles = np.array([0.7, 0.4 + t_s / 1e9])
+            hand.observe_joints(JointReading(reading.t_ns, 0, ("FFJ3", "THJ1"), angles))
         if scenario.missing[0] <= t_s < scenario.missing[1]:
             continue
+        if abs(t_s - interrupt_s) < 1e-6:
+            hand.interrupt()
         lost = scenario.unusable[0] <= t_s < scenario.unusable[1]
         checked = Checked((Reason.ELECTRODES_BROKEN,) if lost else (), ~ALL)
         moment, counts = hand.step(reading.made_ns, reading.counts, checked)
         assert moment.judges is (counts is not None)
-        played.changes += moment.changes
+        played.told.append((t_s, moment, counts))
     return played
 
 
@@ -161,7 +160,7 @@ SCENARIOS = [
         "joints lost",
         GRASPED,
         UP,
-        joint=lambda t_s: 0.7 if t_s <= 0.0 else None,
+        joints_until_s=0.0,
         limits=JOINTS,
         settled_s=(1.0, 1.02),
     ),
@@ -174,7 +173,9 @@ def test_gate_follows(scenario: Scenario) -> None:
     assert played.story == scenario.changes
     if scenario.settled_s is not None:
         earliest, latest = scenario.settled_s
-        assert earliest <= played.first_s(GateState.SETTLED) <= latest
+        changes = [change for _, moment, _ in played.told for change in moment.changes]
+        (settled_ns, *_) = [each.t_ns for each in changes if each.state is GateState.SETTLED]
+        assert earliest <= (settled_ns - START_NS) / 1e9 <= latest
 
 
 def test_the_wire_page_has_all_transitions() -> None:
@@ -187,44 +188,32 @@ SOUND = Checked((), ~ALL)
 
 
 def test_after_a_gap_three_fresh_sweeps_are_judged() -> None:
-    hasty = replace(GATE, early=True)
-    hand = HandTracker(FINGERS, replace(LIMITS, gate=hasty))
-    sweeps = [(t_s, reading) for t_s, reading in readings(FIRM) if not 0.5 < t_s < 0.75]
-    after = [reading.counts for t_s, reading in sweeps if t_s >= 0.75]
-    for t_s, reading in sweeps:
-        _, counts = hand.step(reading.made_ns, reading.counts, SOUND)
-        if counts is not None and t_s > 0.5:
-            since = round((t_s - 0.75) * 100) + 1
-            assert since >= 3
-            window = np.array(after[:since])
-            assert (counts >= window.min(axis=0)).all()
-            assert (counts <= window.max(axis=0)).all()
-            return
-    pytest.fail("it was never judged again")
+    hasty = replace(LIMITS, gate=replace(GATE, early=True))
+    gap = replace(FIRM, missing=(0.505, 0.745), limits=hasty)
+    after = [reading.counts for t_s, reading in readings(gap) if t_s > 0.745]
+    judged = [counts for t_s, _, counts in play(gap).told if t_s > 0.745]
+    number = next(place for place, counts in enumerate(judged, start=1) if counts is not None)
+    assert number >= 3
+    window = np.array(after[:number])
+    counts = judged[number - 1]
+    assert counts is not None
+    assert ((window.min(axis=0) <= counts) & (counts <= window.max(axis=0))).all()
 
 
 def test_after_readings_were_left_out_a_grasp_settles_again() -> None:
-    hand, since = HandTracker(FINGERS, LIMITS), 0
-    now = hand.silent()
-    for t_s, reading in readings(FIRM):
-        if abs(t_s - 0.8) < 1e-6:
-            assert now.settled
-            hand.interrupt()
-        now, _ = hand.step(reading.made_ns, reading.counts, SOUND)
-        since += t_s > 0.8 - 1e-6
-        if since and now.settled:
-            break
+    told = play(FIRM, interrupt_s=0.8).told
+    before, *settled = [moment.settled for t_s, moment, _ in told if t_s > 0.785]
+    assert before
     # The first begins the motion again; 24 readings later the long window is full.
-    assert since == 1 + 24
+    assert settled.index(True) == 24
 
 
 def test_a_finger_that_need_not_touch_need_not_be_tared() -> None:
     hand = HandTracker(FINGERS, replace(LIMITS, required=FINGERS[:2]))
     for t_s, reading in readings(FIRM):
         counts = reading.counts.copy()
-        counts[2] += round(
-            22.0 * (t_s + 5.0)
-        )  # it warms up too fast for the tare, and does not slide
+        # It warms up too fast for the tare, and does not slide.
+        counts[2] += round(22.0 * (t_s + 5.0))
         now, _ = hand.step(reading.made_ns, counts, SOUND)
         if t_s > 0.7:
             break
@@ -268,7 +257,7 @@ def test_joints_are_lost_when_readings_continue_without_them() -> None:
     silent = Scenario("no joints", GRASPED, UP, limits=replace(LIMITS, joints=True))
     assert "joints" not in HandTracker(FINGERS, silent.limits).health(), "nothing came yet"
     assert play(silent).hand.health()["joints"] is Reason.JOINTS_LATE
-    assert "joints" not in play(replace(silent, joint=lambda t_s: 0.7)).hand.health()
+    assert "joints" not in play(replace(silent, joints_until_s=math.inf)).hand.health()
     assert "joints" not in play(replace(silent, limits=LIMITS)).hand.health(), "not required"
 
 
