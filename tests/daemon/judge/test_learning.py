@@ -10,10 +10,11 @@ from graspd.daemon.judge.decision import HandLimits, Limits
 from graspd.daemon.judge.pipeline import Judgement, Pipeline
 from graspd.daemon.judge.reasons import Decision, GateState, Moment, Reason
 from graspd.drivers.twins.grasps import synthetic
+from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps
 from graspd.models import zoo
 from graspd.models.judge.session import SessionCalibration
 from graspd.models.runtime import TactileModel
-from tests.daemon.fakes import sound
+from tests.daemon.fakes import Clock, sound
 
 Learnt = list[NDArray[np.generic]]
 
@@ -103,3 +104,18 @@ def test_a_session_learns_only_what_the_strict_limit_lets_pass(
     judge(gated, rows)
     # Of the second grasp alone: the first reading by which it kept still.
     np.testing.assert_array_equal(learnt, rows[2:3])
+
+
+def test_a_grasp_teaches_the_session_only_when_over(learnt: Learnt) -> None:
+    model, clock = TactileModel(zoo.find("small-session")), Clock()
+    gated = Pipeline(model, model.contract.fingers, Limits(), clock, hand=HandLimits())
+    judged = []
+    for moment in synthetic_grasps(1, seed=1):
+        clock.now_ns += 10_000_000
+        said = gated.judge(sound(moment.counts, clock()))
+        gated.learn()
+        judged += [said.judged_counts] if said.moment.judged else []
+        if said.moment.state is GateState.JUDGED:
+            assert not learnt
+    assert len(learnt) == 1
+    np.testing.assert_array_equal(learnt[0], judged[0])

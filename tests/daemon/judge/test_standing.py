@@ -5,24 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
-from graspd.daemon.judge.decision import HandLimits, Limits
-from graspd.daemon.judge.pipeline import Judgement, Pipeline
-from graspd.daemon.judge.reasons import Decision, GateState, Reason
+from graspd.daemon.judge.decision import HandLimits
+from graspd.daemon.judge.pipeline import Judgement
+from graspd.daemon.judge.reasons import Decision, Reason
 from graspd.daemon.trust.lift_book import GraspId, OutcomeStatus
 from graspd.daemon.trust.trust import Trust
 from graspd.drivers.base import ElectrodeFault
-from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps
-from graspd.models import zoo
-from graspd.models.judge.session import SessionCalibration
-from graspd.models.runtime import TactileModel
 from graspd.models.trust.risk import RiskLimits
-from tests.daemon.fakes import MS, Clock, sound
 from tests.daemon.judge.felt_hand import HELD, Feel, Flaw, Hand, begins, feels, gates, tared
 from tests.daemon.judge.felt_hand import limits as gate_limits
 
@@ -91,29 +83,6 @@ def test_under_a_risk_waiting_brings_no_lucky_draw() -> None:
     reasons = {reason for each in said[60:] for reason in each.reasons}
     assert Reason.LOW_CONFIDENCE in reasons
     assert trust.report().outstanding <= 1
-
-
-def test_a_grasp_teaches_the_session_only_when_over(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    taken: list[NDArray[np.generic]] = []
-    monkeypatch.setattr(SessionCalibration, "observe", lambda _, counts, slip: taken.append(counts))
-    model, clock = TactileModel(zoo.find("small-session")), Clock()
-    judge = Pipeline(model, model.contract.fingers, Limits(), clock, hand=gate_limits())
-    held, judged = 0, []
-    grasp = synthetic_grasps(1, seed=1)
-    (timetable,) = grasp.timetables()
-    for moment in grasp:
-        clock.now_ns += 10 * MS
-        said = judge.judge(sound(moment.counts, clock()))
-        judge.learn()
-        held += timetable.closed_s <= moment.t_s < timetable.lift_s
-        judged += [said.judged_counts] if said.moment.judged else []
-        if said.moment.state is GateState.JUDGED:
-            assert not taken
-    assert held
-    assert len(taken) == 1
-    np.testing.assert_array_equal(taken[0], judged[0])
 
 
 def test_an_open_hand_is_not_told_to_release_anything() -> None:
