@@ -46,7 +46,7 @@ def test_speed_is_angle_over_time_at_every_rate(rate_hz: float, rad_per_s: float
 
 
 OTHERS = {"none": (), "a finger": ("THJ1",), "those but one": ("FFJ1", "FFJ3")}
-"""Joints of which angles come on; of one of the last no angle is valid."""
+"""Joints whose angles go on; those of all others are not valid any more."""
 
 
 @pytest.mark.parametrize("others", OTHERS.values(), ids=OTHERS)
@@ -62,13 +62,9 @@ def test_joints_are_late_and_then_lost(
     age_ms: int, reason: Reason | None, others: tuple[str, ...]
 ) -> None:
     motion, last_ns = turning(100.0, 0.0)
+    angles = [0.3 if name in others else np.nan for name in ALL]
     for ms in range(10, age_ms + 1, 10):
-        send(
-            motion,
-            last_ns + ms * MS,
-            *[0.3 if name in others else np.nan for name in ALL],
-            names=ALL,
-        )
+        send(motion, last_ns + ms * MS, *angles, names=ALL)
     now_ns = last_ns + age_ms * MS
     assert motion.objection(now_ns) is reason
     assert motion.is_lost(now_ns) is (age_ms > 1000 and not others)
