@@ -46,7 +46,7 @@ def test_speed_is_angle_over_time_at_every_rate(rate_hz: float, rad_per_s: float
 
 
 OTHERS = {"none": (), "a finger": ("THJ1",), "those but one": ("FFJ1", "FFJ3")}
-"""Joints whose angles go on; those of all others are not valid any more."""
+"""Joints whose angles continue; those of all others are not valid any more."""
 
 
 @pytest.mark.parametrize("others", OTHERS.values(), ids=OTHERS)
