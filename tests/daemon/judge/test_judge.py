@@ -118,10 +118,11 @@ def test_a_reading_of_other_fingers_is_unknown() -> None:
 
 
 def test_silence_is_stale() -> None:
-    judgement = pipeline(FakeModel(), Clock()).silence(5)
-    assert judgement.decision is Decision.UNKNOWN
-    assert judgement.reasons == (Reason.STALE,)
-    assert judgement.t_ns == 5
+    clock = Clock()
+    last_ns = clock() - 10**9
+    judgement = pipeline(FakeModel(), clock).silence(last_ns)
+    assert (judgement.decision, judgement.t_ns) == (Decision.UNKNOWN, last_ns)
+    assert judgement.reasons == (Reason.STALE,), "named once"
 
 
 BOOT = "b" * 32

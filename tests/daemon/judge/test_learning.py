@@ -46,7 +46,7 @@ def learnt(monkeypatch: pytest.MonkeyPatch) -> Learnt:
 def test_a_grasp_is_learnt_once_after_its_verdict(pipeline: Pipeline, learnt: Learnt) -> None:
     judge(pipeline, grasps(3))
     assert pipeline.session is not None
-    pipeline.health()
+    assert pipeline.health()["session"] is Reason.NOT_CALIBRATED
     assert len(learnt) == 2, "the third waits for the next reading, whoever looks"
     pipeline.learn()
     pipeline.learn()
