@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import socket
 import struct
 import subprocess
@@ -23,10 +22,9 @@ from graspd.daemon.publish.keys import load_pair, make
 from graspd.daemon.publish.sockets import Door, Sockets
 from graspd.daemon.trust.lift_book import GraspId, LiftBook
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING
-from tests.daemon.processes import TIMEOUT_S, start, wait_for
+from tests.clients.bench import Daemon
 from tests.daemon.publish.doors import (
     CURVE,
-    WAIT_MS,
     Asked,
     Peers,
     opened_door,
@@ -138,29 +136,18 @@ def test_tellers_cannot_be_checked_on_plain_tcp(tmp_path: Path) -> None:
 
 
 def test_a_killed_daemon_takes_the_outcome_after_its_restart(tmp_path: Path, peers: Peers) -> None:
-    path = tmp_path / "scene.toml"
-    path.write_text(
-        '[tactile]\ndriver = "replay"\nloop = true\n'
-        f'recordings = ["{DEMO_RECORDING}"]\n[session]\nkeep = true\nfolder = "s"\n'
-        f'[publish]\nendpoint = "ipc://{tmp_path}/v"\n[ask]\nendpoint = "ipc://{tmp_path}/ask"\n'
-    )
-    asker = peers.connect(zmq.DEALER, f"ipc://{tmp_path}/ask", name=NAME)
-    asker.rcvtimeo = WAIT_MS
-    with start("run", path) as daemon:
-        wait_for(tmp_path / "ask")
+    session = '[session]\nkeep = true\nfolder = "s"\n'
+    with Daemon(tmp_path, session, recording=DEMO_RECORDING) as daemon:
+        asker = peers.connect(zmq.DEALER, daemon.ask_endpoint, name=NAME)
         answer: dict[str, Any] = {}
         while answer.get("verdict") != "stable":
             asker.send(b"lift")
             answer = json.loads(asker.recv())
-        daemon.send_signal(signal.SIGKILL)
-        daemon.communicate(timeout=TIMEOUT_S)
-    with start("run", path) as daemon:
+        daemon.kill()
+        daemon.start()
         told = f"outcome {answer['boot_id']} {answer['grasp']} slip".encode()
-        stranger = peers.connect(zmq.DEALER, f"ipc://{tmp_path}/ask", name=OTHER)
         taken = []
-        for peer in (stranger, asker):
+        for peer in (peers.connect(zmq.DEALER, daemon.ask_endpoint, name=OTHER), asker):
             peer.send(told)
             taken.append(json.loads(peer.recv())["ok"])
-        daemon.terminate()
-        daemon.communicate(timeout=TIMEOUT_S)
     assert taken == [False, True]

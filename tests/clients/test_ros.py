@@ -1,4 +1,4 @@
-"""The feeders for ROS, with stand-ins for what they import of ROS, and the drivers they feed."""
+"""The examples for ROS, beside stand-ins for what they import of ROS: it is not there."""
 
 from __future__ import annotations
 
@@ -14,15 +14,18 @@ from typing import Any
 
 import pytest
 
+from deploy.clients.python import graspd_client
 from graspd.drivers.base import JointReading, TactileReading
 from graspd.drivers.datagrams.joints import JointStreamDriver
 from graspd.drivers.datagrams.tactile import TactileStreamDriver
 from tests.clients.building import CPP
+from tests.clients.false_daemon import false_daemon
 from tests.drivers.one_sweep import tactile
 from tests.drivers.palm.palm_stream import joints
 from tests.kit.waiting import wait_until
 
 FOLDER = CPP.parent / "ros"
+NODE = CPP.parent / "ros2" / "grasp_node.py"
 START_S = 1_700_000_000
 SENSORS = 5
 """Length of `BiotacAll.tactiles`: first, middle, ring and little finger, thumb (sr_robot_msgs)."""
@@ -139,6 +142,14 @@ class Ros:
         }
 
 
+def stand_in(monkeypatch: pytest.MonkeyPatch, modules: dict[str, dict[str, Any]]) -> None:
+    """Have these modules hold this for those that import them."""
+    for name, holds in modules.items():
+        module = ModuleType(name)
+        vars(module).update(holds)
+        monkeypatch.setitem(sys.modules, name, module)
+
+
 def free_ports() -> int:
     """Return a UDP port that is free, as are those before and after it."""
     while True:
@@ -159,10 +170,7 @@ def free_ports() -> int:
 def test_a_feeder_sends_what_the_topics_have(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert len((FOLDER / name).read_text().splitlines()) <= 40
     port = free_ports()
-    for module, holds in Ros({"port": port}).modules().items():
-        stand_in = ModuleType(module)
-        vars(stand_in).update(holds)
-        monkeypatch.setitem(sys.modules, module, stand_in)
+    stand_in(monkeypatch, Ros({"port": port}).modules())
     sweeps: list[TactileReading] = []
     angles: list[JointReading] = []
     with (
@@ -189,3 +197,89 @@ def test_a_feeder_sends_what_the_topics_have(name: str, monkeypatch: pytest.Monk
         "FFJ3": 0.5,
         "THJ5": -0.1,
     }
+
+
+class Node:
+    """The part of `rclpy.node.Node` that the example uses."""
+
+    endpoints: dict[str, str]
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.published: dict[str, list[str]] = {}
+        self.timers: dict[float, Callable[[], None]] = {}
+        self.served: dict[str, Callable[[Any, Any], Any]] = {}
+
+    def declare_parameter(self, name: str, value: str) -> SimpleNamespace:
+        assert value.startswith("ipc:///run/graspd/")
+        return SimpleNamespace(value=self.endpoints[name])
+
+    def create_publisher(self, _kind: type, topic: str, depth: int) -> SimpleNamespace:
+        assert depth == 1, "what is old is not to be delivered"
+        texts = self.published.setdefault(topic, [])
+        return SimpleNamespace(publish=lambda message: texts.append(message.data))
+
+    def create_timer(self, period_s: float, callback: Callable[[], None]) -> None:
+        self.timers[period_s] = callback
+
+    def create_service(self, _kind: type, name: str, callback: Callable[[Any, Any], Any]) -> None:
+        self.served[name] = callback
+
+    def ask(self, service: str, **request: bool) -> tuple[bool, str]:
+        answer = self.served[service](SimpleNamespace(**request), SimpleNamespace())
+        return answer.success, answer.message
+
+
+class String(SimpleNamespace):
+    """`std_msgs.msg.String`."""
+
+
+class Service:
+    """A kind of service."""
+
+    Request = Response = SimpleNamespace
+
+
+@pytest.fixture
+def node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Node:
+    stand_in(
+        monkeypatch,
+        {
+            "rclpy": {},
+            "rclpy.node": {"Node": Node},
+            "std_msgs": {},
+            "std_msgs.msg": {"String": String},
+            "std_srvs": {},
+            "std_srvs.srv": {"SetBool": Service, "Trigger": Service},
+            "graspd_client": vars(graspd_client),
+        },
+    )
+    Node.endpoints = {"endpoint": f"ipc://{tmp_path}/out", "ask_endpoint": f"ipc://{tmp_path}/ask"}
+    made: Node = runpy.run_path(str(NODE))["GraspNode"]()
+    return made
+
+
+def test_the_node_publishes_answers_and_tells(node: Node, tmp_path: Path) -> None:
+    decisions = node.published["~/decision"]
+    ((period_s, publish),) = node.timers.items()
+    assert period_s * 1e3 < 100, "in less than the age limit"
+
+    def is_stable() -> bool:
+        publish()
+        return decisions[-1] == "stable"
+
+    publish()
+    assert decisions == ["unknown no-message"]
+    with false_daemon(tmp_path):
+        wait_until(is_stable)
+        wait_until(lambda: node.ask("~/may_i_lift") == (True, "stable"))
+        wait_until(lambda: node.ask("~/held", data=True) == (True, ""))
+        assert node.ask("~/may_i_lift") == (False, "unknown outcome-told")
+    node.graspd.close()  # type: ignore[attr-defined]
+
+
+def test_the_node_says_why_it_refuses(node: Node, tmp_path: Path) -> None:
+    with false_daemon(tmp_path, outcome="unknown", reasons=["moving"]):
+        wait_until(lambda: node.ask("~/may_i_lift") == (False, "unknown moving"))
+        assert node.ask("~/held", data=True) == (False, "no lift was allowed")
+    node.graspd.close()  # type: ignore[attr-defined]
