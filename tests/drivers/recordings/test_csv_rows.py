@@ -59,6 +59,13 @@ def test_columns_stand_in_any_order() -> None:
     assert row.annotation.object_name is None
 
 
+def test_only_unknown_columns_are_listed() -> None:
+    header = [*TABLE_HEADER, "force", "", "s", "force", "FFJ3"]
+    content = ",".join(header).encode() + b"\n" + b"0," * 78 + b"0\n"
+    found = survey(PATH, io.BytesIO(content), ("mf",))
+    assert found.columns.ignored == ("force", "", "s", "force")
+
+
 GOOD = table(2)
 BAD_FILES = {
     "empty": (b"", "grasps.csv: the file is empty"),
