@@ -281,6 +281,12 @@ def test_an_unreadable_file_is_refused_by_its_path(
         load_calibration(path)
 
 
+def test_a_file_has_at_most_256_kilobytes(tmp_path: Path) -> None:
+    path = tmp_path / "hand.toml"
+    path.write_text(EXAMPLE.read_text().ljust(262_144, "#"))
+    assert load_calibration(path).tables
+
+
 values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
     lambda inner: (
