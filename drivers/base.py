@@ -34,7 +34,7 @@ def joint_name(column: str) -> str | None:
 
 
 def sensor_rows(fingers: Sequence[str], sensors: Sequence[str] | None) -> tuple[int, ...]:
-    """Return the number of each finger's sensor at the device, from 0.
+    """Return, for each of `fingers`, the number of its sensor at the device, from 0.
 
     `sensors`: all fingers in the order of the device; None: the same as `fingers`. Raises
     `ValueError` if one of `fingers` is not among them.
@@ -57,7 +57,7 @@ class ElectrodeFault(IntFlag):
     HELD = 16
     """The value repeats an earlier sweep; nothing new was sampled."""
     CUT_OFF = 32
-    """The last row of a file ends without a line end; its values may be cut off."""
+    """The row is the last of a file and has no line end, so its values may be cut off."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,13 +85,13 @@ class TactileReading(msgspec.Struct, frozen=True, eq=False, gc=False):
     """Shape (fingers, 24), `ElectrodeFault` bits per electrode."""
     annotation: Annotation | None = None
     recorded_ns: int | None = None
-    """Time since the recording's zero, ns; None for live readings. Playing has any speed."""
+    """Time since the recording's zero, ns, whatever the speed of playing; None: a live reading."""
     interrupted: bool = False
-    """True if it does not continue the reading before: its sender restarted or was lost."""
+    """True if the reading does not continue the last one: its sender restarted or was lost."""
 
     @property
     def made_ns(self) -> int:
-        """Time for intervals between readings, ns. Use `t_ns` for the age of a reading."""
+        """Time at which the reading was made, ns, to compute intervals. Use `t_ns` for its age."""
         return self.t_ns if self.recorded_ns is None else self.recorded_ns
 
     def __post_init__(self) -> None:
@@ -141,7 +141,7 @@ class LinkCause(Enum):
     """Cause of a link that is not up. Programs compare this, never the text."""
 
     UNKNOWN = auto()
-    """The link was not tried yet, or only the text tells the cause."""
+    """The link was not tried yet, or only the text names the cause."""
     NOT_FOUND = auto()
     DENIED = auto()
     IN_USE = auto()
@@ -155,18 +155,18 @@ class LinkCause(Enum):
     """The port is open, but no byte has arrived yet."""
     NO_ANSWER = auto()
     FOREIGN = auto()
-    """The only data comes from a sender that is refused."""
+    """Data arrives only from a sender that is refused."""
     TIMEOUT = auto()
     """Readings came, then stopped for longer than the timeout."""
     DISCONNECTED = auto()
     """The device went away or was reset."""
     VERSION = auto()
     SETTINGS = auto()
-    """The device samples other electrodes or rates than the scene needs, or than before."""
+    """The device's electrodes or rate differ from those that the scene needs, or from before."""
     SERIALS = auto()
     """The device gives different serial numbers each time it is asked."""
     CLOCK = auto()
-    """The device's clock stands, falls back or jumps."""
+    """The device's clock stands still, goes back or jumps."""
 
 
 _CAUSES: dict[int | None, LinkCause] = {
@@ -195,7 +195,7 @@ class DeviceFault(Enum):
     SWEEP_TOO_LONG = auto()
     BUS_ERROR = auto()
     SEQUENCE = auto()
-    """It samples other channels than the scene says."""
+    """The device samples other channels than the scene says."""
 
 
 class Fact(NamedTuple):
@@ -253,7 +253,7 @@ class Driver(Protocol):
 
     @property
     def serials(self) -> dict[str, str]:
-        """Serial numbers of the sensors by finger; links without any give the sender instead.
+        """Serial numbers of the sensors by finger; a link without any gives its sender's address.
 
         A new number means that the sensor was exchanged. Between the readings of two sensors,
         `read_ready` returns nothing once. Fingers whose number is unknown are left out.
@@ -275,7 +275,7 @@ class Driver(Protocol):
         """Return the descriptor to wait on, or None if there is none now."""
 
     def due_ns(self) -> int | None:
-        """Return the monotonic time, ns, of the next call without input, or None."""
+        """Return when to call `read_ready` without input, monotonic ns; None: never."""
 
     def read_ready(self) -> Sequence[Reading]:
         """Return the readings that are complete now, oldest first. Raises `DriverError`."""
@@ -285,7 +285,7 @@ class DriverError(Exception):
     """Base of all driver failures."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the text and the fields: a pool of processes raises it in the parent."""
+        """Pickle text and fields, so that a process pool can raise the error in its parent."""
         return type(self).__new__, (type(self), *self.args), self.__dict__
 
 

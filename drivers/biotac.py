@@ -36,12 +36,10 @@ ERROR_WORDS: dict[int, str] = {
     0xA55F: "nothing to resend",
     0xA557: "write failed",
 }
-"""Error words that a sensor sends in place of data (manual tables 8 and 11, C library).
-
-Without the check of parity they would be counts of 2629 to 2635.
-"""
+"""Error words that a sensor sends in place of data (manual tables 8 and 11, C library). Without the
+parity check they would be read as counts of 2629 to 2635."""
 UNPLUGGED_WORDS = (0x0000, 0xFFFF)
-"""Words of a line that no sensor drives: all zeros or all ones, both of even parity."""
+"""Words read from a line that no sensor drives: all zeros or all ones, with even parity."""
 
 SEQUENCES: Final[dict[str, tuple[int, ...]]] = {
     "electrodes": CHANNELS[4:],
@@ -127,7 +125,8 @@ def make_reading(
 ) -> TactileReading:
     """Return the reading of `words`, shape (fingers, 24), and count it in `counters`.
 
-    `marks`: `ElectrodeFault` bits set beforehand. Words marked `MISSING` are not looked at.
+    `marks`: `ElectrodeFault` bits known before; words marked `MISSING` are ignored.
+    `t_ns`: time of the last byte.
     """
     counts, faults = decode_words(words)
     if np.count_nonzero(faults) or np.count_nonzero(marks):

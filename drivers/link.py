@@ -10,7 +10,7 @@ from typing import Final
 from graspd.drivers.base import Fact, LinkCause
 
 BACKOFF_FIRST_S = 0.05
-"""Wait after the first failure, s: a board that resets is back in a moment."""
+"""Wait after the first failure, s. A board that resets is back soon."""
 BACKOFF_FACTOR = 1.8
 """Factor of the wait from one failure to the next; the seventh wait is the longest."""
 BACKOFF_MAX_S = 1.0
@@ -26,15 +26,16 @@ WARNINGS_MAX = 8
 """Most warnings in one outage, each for another reason; the log cannot fill up."""
 
 CLOCK_STEP_NS: Final = 1_000_000_000
-"""Delay of the first message after a fall of its time, ns, from which that has another zero."""
+"""Fall of a sender's time, ns, seen as delay, from which on that time has another zero."""
 LEAP: Final = 10
-"""Times as fast as here from which a sender's time is not in seconds, or was set."""
+"""Ratio to our clock's speed from which on a sender's time was set or is not in seconds."""
 LEAP_NS: Final = 200_000_000
-"""Rise, ns, beyond that: a message that waited, and losses behind it, rise as far at once."""
+"""Rise of a sender's time that is always allowed, ns, because a delayed message followed by
+losses has such a rise."""
 DRIFT: Final = 1000
-"""Clocks of two computers differ by less than one part in this; NTP slews by half of it."""
+"""Clocks of two computers drift apart by less than one part in this; NTP slews by half that."""
 READABLE: Final = 1
-"""POLLIN of poll(2), which Python has not on all systems."""
+"""POLLIN of poll(2), which Python lacks on some systems."""
 
 _log = logging.getLogger(__name__)
 
@@ -146,9 +147,8 @@ class Link:
 class SenderClock:
     """Bounds the age of messages by their sender's time, which may have any zero.
 
-    The quickest message so far is taken to be on the way for no time. A delay that was there from
-    the first message on, or that grows by less than 1 ms a second, is not seen. Time that falls
-    has another zero.
+    The quickest message so far is assumed to have no delay. A delay of all messages, or one that
+    grows by less than 1 ms a second, is not noticed. Time that falls has another zero.
     """
 
     def __init__(self) -> None:
@@ -159,7 +159,7 @@ class SenderClock:
     def leaps(self, t_s: float | None, received_ns: int) -> bool:
         """Return True if the sender's time passed ten times as fast as here since the last message.
 
-        It is not in seconds, or was set: a delay would not be seen. Leaps of 200 ms pass.
+        Such a time was set or is not in seconds, so it shows no delay. Leaps of 200 ms pass.
         """
         if t_s is None or self._offset_ns is None:
             return False
@@ -167,7 +167,7 @@ class SenderClock:
         return round(t_s * 1e9) - self._sent_ns > LEAP * passed_ns + LEAP_NS
 
     def made_ns(self, t_s: float | None, received_ns: int) -> int:
-        """Return when a message was made at the latest, monotonic ns.
+        """Return the latest time at which a message was made, monotonic ns.
 
         `t_s`: the sender's time, s; None: not known.
         """

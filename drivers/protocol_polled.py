@@ -16,7 +16,7 @@ from graspd.drivers.link import is_ready
 SCHEME = "polled://"
 
 _OF_NETWORK = frozenset({"rfc2217", "socket"})
-"""Schemes of pyserial's URLs of a network, whose form is checked without a device."""
+"""Schemes of pyserial's network URLs, whose form can be checked without a device."""
 
 serial.protocol_handler_packages.append(__package__)
 
@@ -28,7 +28,7 @@ class PolledSerial(serial.Serial):
         """Return the bytes that have arrived, at most `size`. Raises `OSError` after a hang-up."""
         try:
             data = os.read(self.fileno(), size)
-            # A terminal that was hung up is always ready and has nothing.
+            # A terminal that was hung up is always ready and has no data.
             if data or not is_ready(self.fileno()) or (data := os.read(self.fileno(), size)):
                 return data
         except BlockingIOError:

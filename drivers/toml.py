@@ -9,7 +9,7 @@ from typing import Any
 DEPTH_MAX = 8
 """Most parts of a dotted key, and most nested brackets; files of graspd have three of each.
 
-`tomllib` takes time by the square of the first, and stack for the second.
+`tomllib` needs time quadratic in the first number, and stack for the second.
 """
 
 _TOKEN = re.compile(

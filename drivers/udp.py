@@ -16,14 +16,12 @@ from graspd.drivers.link import Link, LinkState
 
 SCHEME = "udp://"
 RECEIVE_BUFFER_BYTES: Final = 128 * 1024
-"""Receive buffer asked of the kernel, bytes; doubled by it, it holds 0.2 s of palm packets.
-
-Packets that wait longer are too old to judge, and a full buffer drops the newest.
-"""
+"""Receive buffer requested of the kernel, bytes. The kernel doubles it: 0.2 s of palm packets.
+Packets that wait longer are too old to judge, and a full buffer drops the newest."""
 DRAIN_MAX = 256
 """Most datagrams of one call, so that a flood does not keep the loop from its other work."""
 STEP_NS: Final = 5_000_000
-"""Change of the wall clock against the monotonic one, ns, that is a step, no adjustment."""
+"""Smallest change of wall clock against monotonic clock, ns, that is a step, not a slew."""
 Sender = tuple[str, int]
 """Numeric address and port of a sender."""
 
@@ -33,7 +31,7 @@ class Endpoint:
     """Address and port to listen on."""
 
     address: str
-    """Numeric address; `0.0.0.0` or `::` is all interfaces, so any computer may send."""
+    """Numeric address; with `0.0.0.0` or `::`, all interfaces, any computer may send."""
     port: int
     """Port; 0 lets the kernel choose one, for tests."""
 
@@ -60,7 +58,7 @@ class Endpoint:
 
 
 def plain(address: str) -> str:
-    """Return an address as senders are compared: IPv4 in IPv6 as IPv4, and without a scope."""
+    """Return an address in the form used to compare senders: no IPv4 in IPv6, no scope."""
     parsed = ipaddress.ip_address(address.partition("%")[0])
     mapped = parsed.ipv4_mapped if isinstance(parsed, ipaddress.IPv6Address) else None
     return str(mapped or parsed)
@@ -72,8 +70,8 @@ class Datagram(NamedTuple):
     data: bytes
     """Content; one byte longer than the receiver's limit if the datagram was too long."""
     age_ns: int
-    """Time since the kernel received it, ns, 0 or more; the most that it can be if the wall clock
-    stepped meanwhile."""
+    """Time since the kernel received it, ns, 0 or more; its upper bound if the wall clock stepped
+    meanwhile."""
     sender: Sender
 
 
@@ -261,7 +259,7 @@ class DatagramDriver(Opened, Generic[Stream]):
         return self.link.retry_ns
 
     def read_ready(self) -> Sequence[Reading]:
-        if self._pauses:  # between the readings of two senders: see `Driver.serials`
+        if self._pauses:  # `Driver.serials` requires a pause between two senders
             self._pauses = False
             return ()
         readings: list[Reading] = []
@@ -309,7 +307,7 @@ class DatagramDriver(Opened, Generic[Stream]):
             self.link.up(self._heard_from, self._clock())
 
     def _fell_silent(self) -> bool:
-        """Return True if the link is down now and was up at the last call."""
+        """Return True if the link went down since the last call."""
         is_up = self.link.state is LinkState.UP
         if is_up and self._clock() - self._good_t_ns >= self.silence_ns:
             silence = f"nothing good for {self.silence_ns / 1e6:.0f} ms"

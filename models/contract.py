@@ -16,7 +16,7 @@ from graspd.biotac import COUNT_MAX, ELECTRODES, Finger
 
 METADATA_KEY = "graspd"
 CLASSES = ("stable", "slip")
-"""Classes in the order of the two probabilities that a model returns."""
+"""Classes, in the order of a model's two probabilities."""
 OUTPUT_NAME = "probability"
 FEATURES_PER_FINGER = ELECTRODES + 2
 """Features of a finger in a session model: 24 z-values, mean and spread."""
@@ -57,7 +57,7 @@ class SeenCounts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     high: tuple[tuple[Count, ...], ...]
     """Largest count of each electrode, shape (fingers, 24)."""
     margin: Count
-    """Counts outside `low`..`high` that still pass as seen."""
+    """Counts beyond `low`..`high` that still count as like the training."""
     centre: tuple[tuple[float, ...], ...]
     """Mean of each electrode, counts, shape (fingers, 24)."""
     whitening: tuple[tuple[float, ...], ...]
@@ -66,7 +66,7 @@ class SeenCounts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     `L @ L.T` is the inverse covariance of all electrodes, one finger after the other.
     """
     distance_max: Annotated[float, msgspec.Meta(gt=0.0)]
-    """Largest root-mean-square whitened deviation of a reading that counts as seen."""
+    """Largest root-mean-square whitened deviation of a reading that is like the training."""
     distance_min: Annotated[float, msgspec.Meta(ge=0.0)] = 0.0
     """Smallest such deviation; a reading below it is the mean of all grasps, not a grasp."""
 
@@ -100,7 +100,7 @@ class Sharpness(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Temperature of a session model's probabilities while the session is young."""
 
     grasps: Annotated[float, msgspec.Meta(ge=0.0)]
-    """Weight of the session's statistics, grasps, from which this temperature is used."""
+    """Weight of the session's statistics, grasps, from which on this temperature is used."""
     temperature: Annotated[float, msgspec.Meta(ge=1.0)]
     """Divisor of the margin (log-odds of slip), measured on a held-out session."""
 
@@ -121,13 +121,13 @@ class SessionInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag=
     prior_grasps: Annotated[float, msgspec.Meta(gt=0.0)]
     """Weight of the training's statistics, grasps."""
     calibrated_from: Annotated[float, msgspec.Meta(ge=0.0)]
-    """Weight of the statistics, grasps, from which the session counts as calibrated."""
+    """Weight of the statistics, grasps, from which on the session counts as calibrated."""
     sharpness: tuple[Sharpness, ...]
     """Temperatures, ascending in `grasps` from 0."""
 
 
 Input = ImageInput | VectorInput | CountsInput | SessionInput
-"""Kinds of input; the JSON key `type` tells which."""
+"""Kinds of input; the JSON key `type` names the kind."""
 
 
 class ConfidenceStep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -155,7 +155,7 @@ class ModelContract(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     measured: tuple[MeasuredError, ...]
     """Scores, one for each protocol; at least one."""
     confidence: tuple[ConfidenceStep, ...]
-    """Points ascending in `confidence`; empty if not measured."""
+    """Points of the accuracy-coverage curve, ascending in `confidence`; empty: not measured."""
     seen: SeenCounts
 
     def to_json(self) -> str:

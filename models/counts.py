@@ -1,7 +1,5 @@
-"""Counts of grasps as a program has them, tables, arrays or lists, as one array.
-
-The names of a table's columns, and the values by name, are all that is asked of its library.
-"""
+"""Counts of grasps as a program has them, tables, arrays or lists, as one array. A table's library
+is only used to get column names, and values by name."""
 
 from __future__ import annotations
 
@@ -50,7 +48,7 @@ def column_names(given: object) -> list[str]:
         if hasattr(type(given), "columns"):
             raise ValueError(f"a {type(given).__name__} has no values yet: collect it first")
         return []
-    names = getattr(getattr(given, "dtype", None), "names", None)  # of a structured array
+    names = getattr(getattr(given, "dtype", None), "names", None)  # a structured array
     for attribute in ("columns", "column_names"):
         names = getattr(given, attribute, names)
     return [] if names is None else list(names)
@@ -64,13 +62,13 @@ def fingers_of(names: Sequence[str]) -> tuple[Finger, ...]:
 def write_csv(table: Any, folder: str) -> Path:  # noqa: ANN401
     """Write a table into a file, a missing value as an empty cell; return its path.
 
-    Raises `ValueError` for a column that is there twice, is rounded, or is longer than others.
+    Raises `ValueError` for a column that occurs twice, is rounded, or is longer than others.
     """
     names, path = column_names(table), Path(folder, "table.csv")
     columns = [_cells(column, what) for what, column in _columns(table, names, names).items()]
     with path.open("w", newline="", encoding="utf-8") as file:
         rows = [names, *zip(*columns, strict=True)]
-        csv.writer(file, quoting=csv.QUOTE_NONNUMERIC).writerows(rows)  # `#1` begins no comment
+        csv.writer(file, quoting=csv.QUOTE_NONNUMERIC).writerows(rows)  # `#1` is not a comment
     return path
 
 
@@ -81,8 +79,8 @@ def _cells(column: Any, what: str) -> list[Any]:  # noqa: ANN401
     if values.dtype.kind == "b":
         values = values.astype(int)  # an outcome
     elif values.dtype == np.float32:
-        values = values.astype(str)  # as it was meant: 28.35, which is 28.350000381 as a double
-    elif values.dtype.kind in "mM":  # without the unit that a number of them would have
+        values = values.astype(str)  # 28.35, not 28.350000381, which it is as a double
+    elif values.dtype.kind in "mM":  # dates as text, because numbers would have a unit
         since = values - values.dtype.type(0, "us")
         values = np.datetime64(0, "us") + since.astype("timedelta64[us]")
     cells: list[Any] = values.tolist()
@@ -90,7 +88,7 @@ def _cells(column: Any, what: str) -> list[Any]:  # noqa: ANN401
 
 
 def check_fingers(fingers: Sequence[str]) -> None:
-    """Raise `ValueError` for a name that is not a finger's, or that is there twice."""
+    """Raise `ValueError` for a name that is not a finger's, or that occurs twice."""
     unknown = [finger for finger in fingers if finger not in FINGERS]
     if unknown:
         raise ValueError(f"no finger is called {unknown[0]!r}: they are {', '.join(FINGERS)}")
@@ -110,10 +108,8 @@ def _of_table(table: Any, names: Sequence[str], fingers: Sequence[str]) -> NDArr
 
 
 def _columns(table: Any, needed: Sequence[str], names: Sequence[str]) -> dict[str, Any]:  # noqa: ANN401
-    """Return columns by what to call them, with None for NA of pandas, which is not a number.
-
-    Raises `ValueError` for one that is there twice, or is not one value for each row.
-    """
+    """Return the `needed` columns by name, with None for NA of pandas, which is not a number.
+    Raises `ValueError` for a column that occurs twice, or lacks one value for each row."""
     found: dict[str, Any] = {}
     shape = None
     for name in needed:
@@ -133,9 +129,9 @@ def _columns(table: Any, needed: Sequence[str], names: Sequence[str]) -> dict[st
 
 
 def _numbers(given: Any, what: str) -> NDArray[np.float64]:  # noqa: ANN401
-    """Return numbers, NaN for what is missing or masked. Raises `ValueError`."""
+    """Return numbers, with NaN for missing or masked ones. Raises `ValueError` for others."""
     try:
-        # Of lists in lists numpy forgets the masks.
+        # numpy loses the masks of arrays within lists.
         nested = isinstance(given, list | tuple) and any(
             isinstance(each, list | tuple) for each in given
         )
@@ -157,7 +153,7 @@ def _refuse_rounded(dtype: np.dtype[Any], what: str) -> None:
 
 
 def _is_number(value: object) -> bool:
-    """Return True for a number, and for None, which is a missing one."""
+    """Return True for a number, and for None, which is a missing number."""
     return value is None or (isinstance(value, Real) and not isinstance(value, bool))
 
 

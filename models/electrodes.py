@@ -17,7 +17,7 @@ from graspd.biotac import ELECTRODES
 from graspd.models.contract import SeenCounts
 
 IMPLAUSIBLE = 8.0
-"""Residual, in its standard deviations, from which an electrode counts as broken.
+"""Residual, in its standard deviations, from which on an electrode counts as broken.
 
 Real grasps have heavier tails than a Gaussian: 7 to 8 % of the held-out ones have an electrode
 beyond this limit. Repairing it changes F1 by at most 0.3 points. Leaving four wrong electrodes
@@ -44,8 +44,8 @@ cost 4.3 and 2.8. Eight of another finger cost at most 0.6.
 LEARNED_DISTANCES = 2.0
 """Largest distance, in units of `distance_max`, of a reading from which a session learns.
 
-A session that learned only from readings that it judges would move its mean towards them, and
-refuse more and more of the others.
+A session that learned only from the readings it judges would move its mean towards them, and
+refuse more and more other readings.
 """
 
 CONTRADICTED_DISTANCES = 0.75
@@ -77,11 +77,11 @@ class Examination(NamedTuple):
     """Result of examining a reading; arrays have shape (fingers, 24)."""
 
     values: NDArray[np.float64]
-    """Its counts, with `implausible` electrodes repaired unless there are too many."""
+    """Counts of the reading, with `implausible` electrodes repaired unless they are too many."""
     implausible: NDArray[np.bool_]
     """True for electrodes that were known to be broken, or do not fit the others."""
     seen: bool
-    """True if it is like the training: a network may judge it."""
+    """True if the reading is like the training, so that a network may judge it."""
     learned: bool
     """True if a session may learn from it."""
 
@@ -129,7 +129,7 @@ class Electrodes:
         implausible = self.implausible(deviations, broken, at_most)
         number = int(np.count_nonzero(implausible))
         if number >= at_most:
-            # The reading as a whole is like nothing in the training.
+            # The reading as a whole is unlike the training.
             return Examination(values, implausible, seen=False, learned=False)
         if number > known:
             values = self.repaired(values, implausible)
@@ -144,7 +144,7 @@ class Electrodes:
         return Examination(values, implausible, seen, self.is_learned(square))
 
     def compare(self, values: NDArray[np.float64]) -> Deviations:
-        """Compare counts, shape (fingers, 24), with what the training makes likely."""
+        """Return the deviations of counts, shape (fingers, 24), from the training."""
         deviations = values.ravel() - self._centre
         return Deviations(deviations, self._precision.dot(deviations))
 
@@ -185,7 +185,7 @@ class Electrodes:
     def repaired(
         self, values: NDArray[np.float64], broken: NDArray[np.bool_]
     ) -> NDArray[np.float64]:
-        """Return `values` with the broken electrodes replaced by what the others predict."""
+        """Return `values` with each broken electrode replaced by the others' prediction."""
         out = broken.ravel()
         deviations = values.ravel() - self._centre
         deviations[out] = 0.0

@@ -1,7 +1,5 @@
-"""Grasps that a model was trained on, known again by a hash of each finger's counts.
-
-A copy of a table is known under any name, and a part of one too.
-"""
+"""Recognise grasps that a model was trained on, by a hash of each finger's counts. Copies and parts
+of a table are recognised under any file name."""
 
 from __future__ import annotations
 
@@ -40,13 +38,13 @@ def as_text(grasps: Hashes) -> str:
 
 
 def are_among(grasps: Hashes, others: Hashes) -> NDArray[np.bool_]:
-    """Return for each grasp, shape (N,), whether one of the others has the same counts."""
+    """Return True for each grasp that has the hashes of one of the `others`, shape (N,)."""
     known = set(map(tuple, others.tolist()))
     return np.array([tuple(each) in known for each in grasps.tolist()], np.bool_)
 
 
 def of_model(model: TactileModel) -> Hashes:
-    """Return the hashes of a model's training grasps; no row if the file does not tell.
+    """Return the hashes of a model's training grasps; no rows if the file has none.
 
     Raises `ModelError` if the file's hashes are broken.
     """
@@ -62,7 +60,7 @@ def of_model(model: TactileModel) -> Hashes:
 
 
 def _of_published(digests: Sequence[str], fingers: Sequence[Finger]) -> Hashes:
-    """Return the hashes of those tables that are published."""
+    """Return the hashes of the published tables among those with these digests."""
     if not set(fingers) <= set(TABLE_FINGERS):
         return np.empty((0, len(fingers)), np.uint32)
     rows = np.fromfile(PUBLISHED, "<u4").reshape(-1, len(TABLE_FINGERS))

@@ -35,7 +35,7 @@ D2A = _layout(
     "0 1 2 2 3 3 4 4 5 5 0 1 2 2 3 3 4 4 5 5 0 1 1 2",
     "4 4 4 3 3 4 4 3 3 4 0 0 0 1 1 0 0 1 1 0 2 3 1 2",
 )
-"""Layout of 6 x 5 pixels. Two tables of D2 were released; the paper does not say which it used."""
+"""Layout of 6 x 5 pixels. Two tables of D2 were released; the paper does not name its own."""
 
 D2B = _layout(
     "D2b",

@@ -7,7 +7,7 @@ Before that, and without a gate, levels show how a finger's electrodes differ fr
 from __future__ import annotations
 
 from collections import Counter
-from statistics import median  # numpy's loads modules at its first call
+from statistics import median  # the first call of numpy's loads modules
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,7 @@ FULL_DEVIATIONS = 2.5
 SHARE = 0.02
 """Weight of a new reading in the rest, which at 100 Hz follows within half a second."""
 STRAY_COUNTS = 20.0
-"""Largest change, counts, that the rest learns from a reading, which may already be a touch."""
+"""Largest change that one reading makes to the rest, counts. It may already be a touch."""
 KNOWN_AFTER = 25
 """Number of readings whose mean is the first rest."""
 
@@ -65,7 +65,7 @@ def fall_of(
 ) -> NDArray[np.float64]:
     """Return how far each electrode of a finger is below `rest`, counts; all shapes (24,).
 
-    `rest` None: the median of the `sound` electrodes. The others get the median fall.
+    `rest` None: below the median of the `sound` electrodes. Others get the median fall.
     """
     reference = median(counts[sound]) if rest is None and sound.any() else rest
     fall = np.zeros(ELECTRODES) if reference is None else reference - counts

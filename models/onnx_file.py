@@ -36,21 +36,19 @@ OPERATORS = {
 """Operators that a model may use, by domain; the first two domains are one.
 
 They are those of `graspd train` and of plain networks made elsewhere. Each ends, whatever the
-counts, and the size of its result does not depend on values: of `SHAPED` and `TREES` that is
+counts, and the size of its result does not depend on values. For `SHAPED` and `TREES` this is
 checked.
 """
 SHAPED = frozenset({"ReduceMean", "ReduceSumSquare", "Reshape", "Slice", "Squeeze", "Unsqueeze"})
-"""Operators whose further inputs give the size of the result.
-
-These inputs must be constants of the model, so that each run takes as long as the first.
-"""
+"""Operators whose inputs after the first give the size of the result. These inputs must be
+constants of the model, so that each run takes as long as the first."""
 ELEMENTWISE = frozenset({"Mul", "Sub"})
-"""Operators whose result is as wide as their widest input. Trees may read what they standardise."""
+"""Operators whose result is as wide as their widest input. Trees may read their results."""
 TEXTS = {"LEAF": 0, "BRANCH_LEQ": 1}
-"""Numbers of the texts that an attribute may have, the kinds of a tree's nodes; 2: another."""
+"""Numbers for the texts of an attribute, which are kinds of a tree's nodes; 2: any other."""
 LEAF, BRANCH = TEXTS.values()
 VALUES = frozenset(range(2, 12))
-"""Fields of an attribute that are its values, each of another kind."""
+"""Field numbers of an attribute's values, one for each type of value."""
 NODE_LISTS = ("treeids", "nodeids", "modes", "featureids", "truenodeids", "falsenodeids")
 
 
@@ -82,7 +80,7 @@ class _Reader:
         """Last dimension of the model's inputs, by name."""
 
     def check(self) -> None:
-        # A message may come in several pieces, so each field with that number is checked.
+        # A message may be split into several fields of one number, so each of them is checked.
         for field_number, value in self._fields(self._content):
             if field_number == 7:
                 self._read_graph(value)
@@ -129,7 +127,7 @@ class _Reader:
             if field_number == 1:
                 name = _text(value)
             elif field_number in (3, 8):
-                values += [value] if isinstance(value, int) else []  # no exporter packs them
+                values += [value] if isinstance(value, int) else []  # no exporter packs values
             elif field_number in (5, 10):
                 self._read_tensor(value)
             elif field_number in (6, 11):
@@ -270,7 +268,7 @@ def _varint(message: memoryview, at: int) -> tuple[int, int]:
         value |= (byte & 0x7F) << 7 * place
         if byte < 0x80:
             if value >> 64:
-                break  # other readers would keep 64 bits
+                break  # other readers would cut it to 64 bits
             return value, at + place + 1
     raise _broken("a number without an end")
 

@@ -1,4 +1,4 @@
-"""Tactile images of grasps for one's own networks and eyes (paper, section II-A)."""
+"""Tactile images of grasps for users and their own networks (paper, section II-A)."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def plot_grasp(counts: ArrayLike, layout: str = "D1", *, fill: str = "neighbour-
     number = images.shape[2]
     titles = fingers_of(names) or (TABLE_FINGERS if number == len(TABLE_FINGERS) else ())
     figure = plt.figure(figsize=(3.2 * number + 0.8, 3.6), layout="constrained")
-    plt.close(figure)  # a notebook draws what is returned, and not a second one
+    plt.close(figure)  # a notebook would draw the figure twice
     panels = figure.subplots(1, number, squeeze=False)[0]
     for finger, axes in enumerate(panels):
         drawn = axes.imshow(images[..., finger], vmin=np.nanmin(images), vmax=np.nanmax(images))
@@ -80,7 +80,7 @@ def plot_grasp(counts: ArrayLike, layout: str = "D1", *, fill: str = "neighbour-
 
 @lru_cache(maxsize=64)
 def _matrix(layout: Layout, fill: Fill, electrodes: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return the fill matrix; the same few electrodes are broken in all grasps of a hand."""
+    """Return the fill matrix, cached: broken electrodes are mostly the same in all grasps."""
     return fill_matrix(layout, fill, electrodes)
 
 

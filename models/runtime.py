@@ -17,7 +17,7 @@ from graspd.models.inputs import InputBuilder, builder
 MAX_MODEL_BYTES = 256 * 2**20
 """Largest model file, bytes; the published CNN1 has 12 MB."""
 WARM_UP_RUNS = 20
-"""Runs before the first verdict; they do the lazy allocation and the page faults."""
+"""Number of runs before the first verdict, which cause all lazy allocation and page faults."""
 
 
 class ModelFile:
@@ -92,7 +92,7 @@ def read(path: Path) -> ModelFile:
 
 def check_operators(path: Path, data: bytes) -> None:
     """Raise `ModelError` unless the file is complete and its operators surely end."""
-    from graspd.models import onnx_file  # models of the zoo do not need it
+    from graspd.models import onnx_file  # not needed for models of the zoo
 
     try:
         onnx_file.check(data)

@@ -46,7 +46,7 @@ AWAY_MAX = 8.0
 The distance is the root mean square over all electrodes. On the published days it is 1.3 to 4.1.
 """
 AWAY_MIN, ORDER_RATIO = 1.0, 1.2
-"""Fingers count as exchanged above this distance, if another order is this factor nearer.
+"""Fingers count as swapped above this distance, if another order is this factor nearer.
 
 The distance is that of `AWAY_MAX`. On the published days the right order is nearer by a factor of
 1.5 to 2.6.
@@ -66,7 +66,7 @@ class SessionState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     slip_share: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.5
     """Share of slips among the latest grasps, by their verdicts."""
     last: tuple[float, ...] | None = None
-    """Last grasp taken in, so that a held grasp is not taken in twice; None: none yet."""
+    """Values of the last grasp, so that a held grasp is not taken in twice; None: no grasp yet."""
 
 
 class SessionStatistics:
@@ -107,7 +107,7 @@ class SessionStatistics:
         self._settle()
 
     def observe(self, values: NDArray[np.float64], *, slip: bool | None = None) -> bool:
-        """Take in one grasp; return False if it is still the last one, or not finite.
+        """Take in one grasp; return False if it repeats the last one, or is not finite.
 
         `slip`: its verdict; None: not judged. Among many slips each weighs less, because a
         mean that moves to the slips would make the next slip look stable.
@@ -192,9 +192,9 @@ def is_odd(
 ) -> bool:
     """Return True if a session cannot have come from grasps of these fingers.
 
-    There are three cases: the sensors are far off; the fingers are exchanged; after `enough`
-    grasps a finger is dead or sees noise alone. Mean and spread of each electrode, in session and
-    training: counts, shape (fingers, 24).
+    There are three cases: the sensors are far off; fingers are swapped; a finger is dead or has
+    only noise, which is tested if `enough` is True (enough grasps). Mean and spread of each
+    electrode, in session and training: counts, shape (fingers, 24).
     """
     ratio = np.sort(spread / training_spread, axis=1)
     middle = ratio.shape[1] // 2

@@ -40,7 +40,7 @@ class Composition(StrEnum):
     """Arrangement of the images of the fingers (paper, section II-C)."""
 
     CHANNELS = "channels"
-    """One behind the other: height x width x fingers."""
+    """Each finger a channel: height x width x fingers."""
     HORIZONTAL = "horizontal"
     """Side by side: height x (fingers * width) x 1."""
     VERTICAL = "vertical"
@@ -52,8 +52,8 @@ def fill_matrix(
 ) -> NDArray[np.float64]:
     """Return the matrix (pixels, 25) from [24 counts, their maximum] to a filled image.
 
-    Pixels are in row-major order. Each row sums to one. `electrodes`: places, 0..23, of those that
-    work, at least one; a pixel of another is filled like one without an electrode.
+    Pixels are in row-major order. Each row sums to one. `electrodes`: numbers, 0..23, of those that
+    work, at least one; the pixels of others are filled as if they had no electrode.
     """
     height, width = layout.shape
     matrix = np.zeros((height, width, ELECTRODES + 1))
@@ -144,13 +144,14 @@ class TactileImager(InputBuilder):
         planes = out.reshape(self._split).transpose(self._axes)
         np.multiply(pixels.reshape(self._planes), scale, out=planes, casting="same_kind")
         if np.count_nonzero(scale) < scale.size:
-            planes[..., scale == 0.0] = 0.0  # and not NaN
+            planes[..., scale == 0.0] = 0.0  # instead of NaN
         return spread
 
     def build_batch(
         self, counts: NDArray[np.generic]
     ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-        """Return images and spreads, each by `build`: training and daemon have the same bits."""
+        """Return images and spreads, each made by `build`, so that training and daemon agree
+        exactly."""
         images = np.empty((len(counts), *self.shape), dtype=np.float32)
         spreads = np.empty((len(counts), self._planes[2]))
         for index, reading in enumerate(counts):

@@ -28,7 +28,7 @@ A start of the daemon waits for it.
 MEMORY_MAX_BYTES = 640 << 20
 """Most memory of the trial's process, bytes; the service has a gigabyte."""
 VARIED = 20
-"""Number of readings of the trial of any counts, and of those like the training's."""
+"""Number of readings in the trial with any counts, and number of those like the training's."""
 REFUSED = 2
 PR_SET_PDEATHSIG = 1
 """Option of prctl(2): a signal for this process when its parent ends."""
@@ -93,8 +93,8 @@ def _try(path: Path, content: bytes) -> None:
 
 
 def main() -> None:
-    """Try the model on stdin, in its own process; print why it is refused."""
-    with suppress(ModuleNotFoundError):  # else only its time is limited
+    """Try the model that stdin holds, in its own process; print why it is refused."""
+    with suppress(ModuleNotFoundError):  # without these limits only its time is limited
         _limit_process()
     path, file = Path(sys.argv[1]), ModelFile(sys.stdin.buffer.read())
     try:
@@ -120,7 +120,7 @@ def _limit_process() -> None:
     import resource
     import signal
 
-    with suppress(AttributeError):  # as where prctl is missing
+    with suppress(AttributeError):  # prctl is missing
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     with suppress(OSError, ValueError):
         resource.setrlimit(resource.RLIMIT_DATA, (MEMORY_MAX_BYTES, MEMORY_MAX_BYTES))

@@ -2,10 +2,10 @@
 
 The sockets of `socketcan` and `udp_multicast` are read directly, because python-can's `recv` is
 several times slower, and fails for descriptors of 1024 and more. Stamps are wall time, which can
-step. The difference of the two clocks when a frame is read turns them into monotonic time, so only
-a step between arrival and reading makes them wrong.
-A frame without a stamp arrived after the last time at which the bus was empty. The server of
-socketcand stamps by its own clock, which tells how old a frame is.
+step. They are converted to monotonic time by the difference of the two clocks when a frame is read,
+so only a step between arrival and reading makes them wrong.
+A frame without a stamp arrived after the last time at which the bus was empty. A socketcand server
+stamps frames by its own clock, from which the age of a frame follows.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from graspd.drivers.kernel_stamps import ANCILLARY_BYTES, SO_RXQ_OVFL, read_stam
 from graspd.drivers.link import SenderClock, is_ready
 
 FRAMES_PER_DRAIN: Final = 512
-"""Most frames of one call: about 100 ms of a full bus. The loop must get its turn."""
+"""Most frames of one `drain`: about 100 ms of a full bus. The loop must get its turn."""
 RECEIVE_BUFFER_BYTES: Final = 1 << 20
 """Receive buffer asked of the kernel, bytes; the usual 208 KiB hold 60 ms at 4400 frames/s."""
 DATAGRAM_BYTES_MAX: Final = 4096
@@ -60,13 +60,11 @@ class CanBus:
         wall_clock: Callable[[], int],
         options: Options = MappingProxyType({}),
     ) -> None:
-        """`bitrate`: bit/s; None: that of the interface. `options`: more arguments of it.
-
-        Raises `ValueError` for what can never be opened.
-        """
+        """`bitrate`: bit/s; None: the interface's default. `options`: its other arguments. Raises
+        `ValueError` for arguments with which no bus can ever be opened."""
         refuse_unusable(interface, channel, bitrate, options)
         self.failure: LinkError | None = None
-        """Why the bus broke; None while it works."""
+        """Error that broke the bus; None while it works."""
         self.more = False
         """True if the last `drain` left frames behind."""
         self.tap: Callable[[list[Stamped]], None] | None = None
@@ -114,7 +112,7 @@ class CanBus:
             return
         with contextlib.suppress(Exception):
             bus.shutdown()
-        # slcan's shutdown first talks to the adapter; if that fails, it leaves the port open.
+        # slcan's shutdown first writes to the adapter. If that fails, it leaves the port open.
         port = getattr(bus, "serialPortOrig", None)
         if port is not None:
             with contextlib.suppress(Exception):
@@ -192,10 +190,8 @@ class CanBus:
                 frames.append((frame, *self._arrived(message.timestamp, since_ns)))
 
     def _in_order(self, stamp_ns: int, now_ns: int) -> int:
-        """Return a time not before the last frame's, nor after now.
-
-        The clocks cannot be read at once: where the system pauses between, stamps seem older.
-        """
+        """Return `stamp_ns`, limited to the range from the last frame's time to now. The clocks
+        cannot be read at the same instant; a pause between makes stamps seem older."""
         if self._newest_ns is not None:
             stamp_ns = max(stamp_ns, self._newest_ns)
         self._newest_ns = min(stamp_ns, now_ns)
@@ -209,13 +205,13 @@ class CanBus:
         self._stamp_s = stamp_s
         if stamp_s < before_s:
             self._server = SenderClock()
-        if stamp_s <= before_s:  # the clock was set, or is too coarse to tell
+        if stamp_s <= before_s:  # the wall clock was set, or is too coarse
             return since_ns, now_ns
         t_ns = self._server.made_ns(stamp_s, now_ns)
         return t_ns, t_ns
 
     def _notice_quiet(self, now_ns: int, received: bool) -> None:
-        """Have a connection that may be lost opened again."""
+        """Set `failure`, so that the bus is reopened, after `QUIET_NS` without a frame."""
         if received:
             self._received_ns = now_ns
         elif now_ns - self._received_ns > QUIET_NS:
@@ -245,10 +241,8 @@ _UNPACK: Final[dict[str, tuple[Callable[[bytes], CanFrame | None], int]]] = {
     "socketcan": (unpack_frame, CAN_FRAME.size + 1),
     "udp_multicast": (_unpack_datagram, DATAGRAM_BYTES_MAX),
 }
-"""Interfaces whose socket is read directly: what unpacks a record, and the bytes read of it.
-
-One byte more than a frame's, so that a longer record is not read as a frame.
-"""
+"""Function that unpacks a record, and bytes to read, for interfaces read by their socket. One byte
+more than a frame is read, so that a longer record is not mistaken for a frame."""
 
 
 def _enlarge_buffer(descriptor: int) -> None:

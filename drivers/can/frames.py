@@ -75,12 +75,12 @@ class CanCounters(DriverCounters):
     """Counters of frames, sweeps and the bus."""
 
     lost_frames: int = 0
-    """Frames that never came, although others of their sweep did."""
+    """Frames that never arrived, although other frames of their sweep did."""
     duplicate_frames: int = 0
     reordered_frames: int = 0
-    """Frames that came in time for their sweep, but after a later one."""
+    """Frames that arrived in time for their sweep, but after a later frame."""
     late_frames: int = 0
-    """Frames that came when their sweep was over; dropped."""
+    """Frames that arrived when their sweep was over; dropped."""
     unsynchronised_frames: int = 0
     """Frames dropped after opening or a known loss, until a sweep began."""
     untimed_frames: int = 0
@@ -94,12 +94,12 @@ class CanCounters(DriverCounters):
     parity_words: int = 0
     error_words: int = 0
     unplugged_words: int = 0
-    """Response words of a line that no sensor drives."""
+    """Response words read from a line that no sensor drives."""
     frames: int = 0
     accepted_frames: int = 0
     """Samples of the configured sensors, duplicates included."""
     foreign_frames: int = 0
-    """Frames with another arbitration id; while the id is unknown, frames without counts."""
+    """Frames with another arbitration id. While the id is unknown: frames without counts."""
     remote_frames: int = 0
     error_frames: int = 0
     """Frames in which the controller reports trouble on the bus."""
@@ -107,7 +107,7 @@ class CanCounters(DriverCounters):
     unknown_commands: int = 0
     """Frames with the right id whose first byte samples no channel."""
     malformed_frames: int = 0
-    """Records that hold no classic frame; one of CAN FD is of another device."""
+    """Records without a classic frame. A CAN FD frame comes from another device."""
     controller_overflows: int = 0
     """Error frames that say that the controller's receive buffer overflowed."""
     kernel_drops: int = 0

@@ -1,7 +1,7 @@
 """Interfaces of python-can: which can work on this computer, with which channel and options.
 
-The extras are those of python-can's own metadata. The name of a module may be another's package, so
-advice names nothing else but the page of the interface.
+The extras are those of python-can's own metadata. For other interfaces advice names only their page
+in python-can's documentation: a package with a module's name may belong to another project.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ NAME_BYTES_MAX: Final = 15
 CONNECT_S: Final = 0.25
 """Longest wait for each step of the connection to socketcand, s; a robot's network needs 1 ms."""
 OWN_OPTIONS: Final[dict[str, dict[str, str | int | float | bool]]] = {
-    # The defaults wait: 2 s after opening, 1 ms in every read.
+    # By default slcan waits for 2 s after opening and for 1 ms in every read.
     "slcan": {"sleep_after_open": 0.0, "timeout": 0.0},
-    # Without it the server may hold frames back for 40 ms, until they are acknowledged.
+    # Without this option the server may hold frames back for 40 ms, until an acknowledgement.
     "socketcand": {"tcp_tune": True},
-    # The default queue has no bound; this one holds about 4 s of a full bus.
+    # The default queue is unbounded. This one holds about 4 s of a full bus.
     "virtual": {"rx_queue_size": 16384},
 }
 
@@ -48,11 +48,11 @@ _EXTRAS: Final[dict[str, tuple[str, str]]] = {
     "cantact": ("cantact", "cantact"),
     "neovi": ("ics", "neovi"),
 }
-"""Module that an interface needs, and the extra of python-can that brings it."""
+"""Module that each interface needs, and the extra of python-can that installs it."""
 _PLUGINS: Final = frozenset({"candle", "canine", "cvector", "remote", "sontheim", "zlgcan"})
-"""Extras of python-can that bring an interface of the same name."""
+"""Extras of python-can that install an interface of the same name."""
 _LIBRARIES: Final = {"kvaser": "canlib", "neousys": "wdt_dio", "pcan": "pcanbasic"}
-"""Libraries of vendors; no package of Python brings them."""
+"""Libraries of vendors, by interface, that no Python package contains."""
 _WINDOWS: Final = frozenset(
     {"etas", "iscan", "ixxat", "nican", "nixnet", "systec", "usb2can", "vector"}
 )
@@ -60,7 +60,7 @@ _BITRATES: Final = {
     "slcan": (10, 20, 50, 83.3, 100, 125, 250, 500, 750, 1000),
     "seeedstudio": (10, 20, 50, 100, 125, 200, 250, 400, 500, 800, 1000),
 }
-"""Rates that an adapter knows, kbit/s; others take any."""
+"""Rates that adapters of an interface support, kbit/s. Other interfaces take any rate."""
 _OWN_KEYS: Final = frozenset({"interface", "channel", "bitrate"})
 _PORT: Final = Annotated[int, msgspec.Meta(ge=1, le=65535)]
 _TYPES: Final[dict[str, dict[str, Any]]] = {
@@ -69,14 +69,14 @@ _TYPES: Final[dict[str, dict[str, Any]]] = {
 """Types of options that python-can does not declare."""
 _WRONG_ARGUMENT: Final = (TypeError, ValueError, OverflowError)
 _ARGUED: Final = frozenset({"gs_usb", "slcan", "socketcan", "socketcand", "udp_multicast"})
-"""Interfaces that raise `_WRONG_ARGUMENT` for arguments alone; others do for absent devices too."""
+"""Interfaces that raise `_WRONG_ARGUMENT` only for arguments. Others also do for absent devices."""
 
-# What python-can logs it also raises, and socketcand logs each piece of a stream.
+# python-can also raises what it logs, and socketcand logs each piece of a stream.
 logging.getLogger("can").setLevel(logging.CRITICAL)
 
 
 def refuse_unusable(interface: str, channel: str, bitrate: int | None, options: Options) -> None:
-    """Raise `ValueError` for what can never be opened on this computer. Opens nothing."""
+    """Raise `ValueError` if such a bus can never be opened on this computer. Opens nothing."""
     if interface not in can.VALID_INTERFACES:
         raise ValueError(f"interface: {_what_there_is(interface)}")
     if interface in _WINDOWS:
@@ -116,7 +116,7 @@ def open_bus(interface: str, channel: str, **options: Any) -> can.BusABC:  # noq
 
 
 def _open_socketcand(channel: str, host: str, port: int, **options: Any) -> can.BusABC:  # noqa: ANN401
-    """Connect within `CONNECT_S`: python-can waits for ever, or spins for ten seconds."""
+    """Connect within `CONNECT_S`. python-can alone would wait for ever, or spin for ten seconds."""
     before_s = socket.getdefaulttimeout()
     socket.create_connection((host, port), CONNECT_S).close()
     socket.setdefaulttimeout(CONNECT_S)
@@ -151,7 +151,7 @@ def _refuse_channel(interface: str, channel: str) -> None:
 
 
 def _refuse_bitrate(interface: str, bitrate: int | None) -> None:
-    """Raise `ValueError` for a bit rate that is not set here, or that the adapter lacks."""
+    """Raise `ValueError` for a bit rate that is set elsewhere, or that the adapter lacks."""
     known = _BITRATES.get(interface)
     if interface == "socketcan" and bitrate is not None:
         raise ValueError("bit rates of socketcan are set by `ip link set CHANNEL type can bitrate`")
@@ -163,7 +163,7 @@ def _refuse_bitrate(interface: str, bitrate: int | None) -> None:
 
 
 def _refuse_options(interface: str, options: Options) -> None:
-    """Raise `ValueError` for options that the interface needs, lacks or has of another type."""
+    """Raise `ValueError` for options that are missing, unknown or of a wrong type."""
     constructor = _constructor(interface)
     parameters = inspect.signature(constructor).parameters
     named = {name for name, each in parameters.items() if each.kind is not each.VAR_KEYWORD}
@@ -180,7 +180,7 @@ def _refuse_options(interface: str, options: Options) -> None:
         own = OWN_OPTIONS.get(interface, {}).get(name, value)
         if own != value:
             raise ValueError(f"options.{name}: must be {own}, or left out")
-        # Some interfaces take arguments out of a dictionary: then their code has the names.
+        # Some interfaces take arguments from a dictionary; their names then stand in its code.
         if name not in named and name not in constructor.__code__.co_consts:
             raise ValueError(f"options.{name}: {_named(interface)} has no such option")
         try:

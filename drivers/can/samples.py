@@ -2,7 +2,7 @@
 
 Frames have no counter. A sample's command byte names its channel; its place in the order of the
 sequence and its time tell its sweep. `classify` decides, by the table in `deploy/can/PROTOCOL.md`.
-No electrode is shifted or filled from memory.
+Counts are never moved to another electrode or repeated from memory.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from graspd.drivers.can.frames import CanCounters
 from graspd.drivers.can.sweep_clock import SweepClock, Timing
 
 REORDER_MAX: Final = 3
-"""Most places by which a sample may be late; adapters with few buffers swap neighbours."""
+"""Most places by which a sample may come late, because some adapters swap neighbours."""
 _ALL: Final = (1 << ELECTRODES) - 1
 
 
 class Held(Enum):
-    """Content of a sample's place: in the current sweep, or, ahead of it, in the one before."""
+    """Content of a sample's place in the current sweep, or beyond it in the sweep before."""
 
     NOTHING = auto()
     SAME = auto()
@@ -37,10 +37,10 @@ class Fate(Enum):
     """Fate of a sample."""
 
     BEGINS = auto()
-    """It ends the current sweep and begins another."""
+    """The sample ends the current sweep and begins another."""
     PLACED = auto()
     REORDERED = auto()
-    """It takes its place, after a later one did."""
+    """The sample takes its place, although a later one arrived before it."""
     COPY = auto()
     """Dropped."""
     LATE = auto()
@@ -69,7 +69,7 @@ def classify(place: int, last: int, timing: Timing, held: Held, *, is_over: bool
 
 
 class _Sweep:
-    """The words of the current sweep by place, and behind them those of the sweep before."""
+    """Words of the current sweep by place; beyond its last place those of the sweep before."""
 
     def __init__(self, width: int) -> None:
         """`width`: bytes of a sample's words."""
@@ -78,11 +78,11 @@ class _Sweep:
         self.have = 0
         """Bit i is set if place i arrived."""
         self.before = _ALL
-        """The same of the sweep before."""
+        """Bit i is set if place i of the sweep before arrived."""
         self.last = -1
         """Furthest place so far; -1: none."""
         self.is_over = False
-        """True if its reading was handed over."""
+        """True if the reading of this sweep was handed over."""
 
     def begin(self) -> None:
         self.have = 0
@@ -113,10 +113,8 @@ class SampleAssembler:
         counters: CanCounters,
         rows: Sequence[int],
     ) -> None:
-        """`sequence`: one of `SEQUENCES`. `sensors`: number of words in a sample.
-
-        `rows`: number of each row's sensor, from 0.
-        """
+        """`sequence`: one of `SEQUENCES`. `sensors`: number of words in a sample. `rows`: for each
+        row of a reading, the number of its sensor, from 0."""
         electrodes = [channel for channel in sequence if E1 <= channel <= E24]
         self._place = {channel: place for place, channel in enumerate(electrodes)}
         self._others = frozenset(sequence) - set(electrodes)
@@ -166,7 +164,7 @@ class SampleAssembler:
             return ()
         timing = clock.timing(place, sweep.last, until_ns)
         if place == sweep.last + 1 and timing is not Timing.LATE:
-            return self._store(place, words, t_ns)  # the usual case, by the same table
+            return self._store(place, words, t_ns)  # the usual case of `classify`, without its cost
         held = sweep.held(place, words)
         fate = classify(place, sweep.last, timing, held, is_over=sweep.is_over)
         if fate is Fate.PLACED:

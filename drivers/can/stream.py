@@ -73,14 +73,14 @@ class CanStream:
         """`bus`: its name in messages. Raises `ValueError` for options that do not fit.
 
         `fingers`: the rows of a reading. `sensors`: the fingers in the order of the board's words,
-        three at most; None: `fingers`. `arbitration_id`: above 0x7FF it has 29 bits. None: that of
-        the first sound sample, until the link is lost; use that for bring-up only. `sequence`: a
+        three at most; None: `fingers`. `arbitration_id`: above 0x7FF it has 29 bits. None: take the
+        id of the first sound sample, until the link is lost; for bring-up only. `sequence`: a
         key of `SEQUENCES`. `data_length`: bytes of a frame that the board pads.
         """
         self.counters = CanCounters()
         self.link = Link(NAME)
         self.last_error: str | None = None
-        """Last failure of the bus or error frame, for people; silence does not count."""
+        """Text of the last failure of the bus or error frame; silence is not included."""
         self._where, self._sequence = bus, sequence
         self._accepted = 0
         self._silent_at_ns = 0
@@ -119,16 +119,16 @@ class CanStream:
         return facts
 
     def _has_sequence(self) -> bool:
-        """Return False if far more or fewer samples than expected are not of electrodes."""
+        """Return False if samples of other channels are below 1/4 or above 4 times the expected."""
         counters, expected = self.counters, len(SEQUENCES[self._sequence]) - ELECTRODES
         readings = counters.readings
         others = counters.accepted_frames - ELECTRODES * readings + counters.lost_frames
-        if readings < READINGS_MIN or not expected:  # others are `unexpected_channels` then
+        if readings < READINGS_MIN or not expected:  # other samples count as `unexpected_channels`
             return True
         return 0.25 < others / (expected * readings) < 4.0
 
     def receive(self, frames: Sequence[Stamped]) -> tuple[list[Reading], LinkError | None]:
-        """Return the readings that are complete, oldest first, and why the bus is lost."""
+        """Return the completed readings, oldest first, and why the bus is lost; None: it is not."""
         readings: list[Reading] = []
         trouble = None
         self.counters.frames += sum(frame.flags != LOST for frame, _, _ in frames)
@@ -174,7 +174,7 @@ class CanStream:
         self.counters.link_losses = self.link.losses
 
     def _take_special(self, frame: CanFrame) -> LinkError | None:
-        """Count a remote or error frame; return why the link is lost, if it is."""
+        """Count a remote or error frame; return why the link is lost; None: it is not."""
         if frame.flags & (REMOTE | LOST):
             self.counters.remote_frames += bool(frame.flags & REMOTE)
             return None

@@ -15,20 +15,20 @@ from graspd.biotac import ELECTRODES
 from graspd.drivers.link import OUTAGE_NS
 
 NEXT_SWEEP_PERIODS: Final = 0.75
-"""Delay, in periods, from which a sample belongs to another sweep.
+"""Delay, in periods, from which on a sample belongs to another sweep.
 
-A loss of whole sweeps delays a sample by one period or more. A lower limit is the safe side: a
-sweep cut without need is flagged, two sweeps mixed in one reading would not be.
+A loss of whole sweeps delays a sample by one period or more. The limit is lower to be safe: a
+sweep that is cut without need is flagged, but a mixture of two sweeps would not be.
 """
 SLOT_MIN_NS: Final = 100_000
 """Shortest time between samples, ns: 103 bits at 1 Mbit/s, as on the fastest board."""
 ARRIVAL_JITTER_NS: Final = 5_000_000
 """Delay of a sweep, ns, up to which no sweep counts as missed."""
 EVEN_SHARE: Final = 1 / 3
-"""Largest gap between two samples without a lost sweep, in periods; a lost one takes half."""
+"""Largest gap of samples without a lost sweep, in periods. A lost sweep makes one of half."""
 PERIODS_KEPT: Final = 15
 PERIODS_NEEDED: Final = 5
-"""Measured periods after which the period is known; it is the median of the last 15."""
+"""Number of measured periods after which the period is known, as the median of the last 15."""
 
 
 class Timing(Enum):
@@ -52,18 +52,18 @@ class SweepClock:
         self._position = [slot / samples for slot in slots]
         self._shortest_ns = samples * SLOT_MIN_NS
         self._late_ns = NEXT_SWEEP_PERIODS * self._shortest_ns
-        """Delay from which a sample belongs to another sweep."""
+        """Delay from which on a sample belongs to another sweep, ns."""
         self._gaps_ns: deque[int] = deque(maxlen=PERIODS_KEPT)
         self._origin_ns = 0.0
-        """Start of the current sweep, by its most punctual sample."""
+        """Start of the current sweep, ns, computed from its most punctual sample."""
         self._start_ns: int | None = None
-        """Start of the sweep before."""
+        """Start of the sweep before, ns; None: not known."""
         self._end_ns: int | None = None
         self._at_ns = 0
         self._widest_ns = 0
-        """Widest time between two samples since the sweep before."""
+        """Longest time between two samples since the sweep before, ns."""
         self._is_torn = False
-        """True if a sweep without its last sample was ended since."""
+        """True if a sweep that lacked its last sample was ended since then."""
         self.interrupt()
 
     def interrupt(self) -> None:
@@ -79,7 +79,7 @@ class SweepClock:
         """Number of samples in a row without a gap in their order."""
 
     def follow(self, place: int, t_ns: int) -> bool:
-        """Take note of any sample; return True if a sweep begins with it or after the last one."""
+        """Note any sample; return True if its place shows that a sweep began since the last one."""
         begins = place == 0 or place < self._seen
         if place != self._seen:
             follows = place == (self._seen + 1) % ELECTRODES
@@ -91,7 +91,8 @@ class SweepClock:
         return begins
 
     def is_vague(self, t_ns: int, until_ns: int) -> bool:
-        """Return True if a sample that arrived in this range may be of two sweeps."""
+        """Return True if a sample that arrived in this range, ns, may belong to either of two
+        sweeps."""
         return until_ns - t_ns >= self._late_ns
 
     def timing(self, place: int, last: int, until_ns: int) -> Timing:
@@ -109,7 +110,7 @@ class SweepClock:
         return Timing.EARLY if is_early else Timing.FITS
 
     def advance(self, place: int, t_ns: int, *, begins: bool) -> None:
-        """Take the time of a sample at the furthest place of the current sweep so far."""
+        """Note the time of a sample whose place is the furthest of the current sweep so far."""
         origin_ns = t_ns - self._position[place] * (self.period_ns or 0)
         if begins or origin_ns < self._origin_ns:
             self._origin_ns = origin_ns

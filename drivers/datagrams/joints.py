@@ -61,10 +61,10 @@ class JointStream:
         self._order = Order(self.counters)
 
     def interrupt(self) -> None:
-        """Do nothing: the order of messages is kept, so that no old one is mistaken for new."""
+        """Do nothing: the last number and time stay, so that no old message is mistaken for new."""
 
     def receive(self, data: bytes, t_ns: int) -> list[JointReading] | None:
-        """Return the reading, none if no joint is known; None if the message is dropped."""
+        """Return the reading; [] if no joint is known; None if the message is dropped."""
         message, restarts = self.parse(data), self.counters.restarts
         if message is None or not self._order.admits(message.stamp):
             return None
@@ -88,7 +88,7 @@ class JointStream:
                 continue
             angle = _angle(value)
             self.counters.bad_angles += math.isnan(angle)
-            # `rh_FFJ3` beside `FFJ3` is one joint with two angles: neither is trusted.
+            # `rh_FFJ3` and `FFJ3` are one joint with two angles, of which neither is trusted.
             self.counters.bad_angles += joint in angles
             angles[joint] = math.nan if joint in angles else angle
         position_rad = np.array(list(angles.values()), dtype=float)

@@ -1,4 +1,4 @@
-"""JSON datagrams: one object a message, put in order by its sender's number and time."""
+"""JSON datagrams, one object each, put in order by the sender's number and time."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ SHOWN_BYTES_MAX: Final = 80
 SILENCE_NS: Final = 500_000_000
 """Timeout of a link, ns: 50 messages at 100 Hz. A sender of 10 Hz passes."""
 NUMBER_MAX: Final = (1 << 63) - 1
-"""Largest number, either sign, that is read."""
+"""Largest absolute value of a number that is read."""
 SEQ_JUMP_MAX: Final = 1000
 """Largest jump ahead of `seq` that counts as a loss; after a larger one the sender restarted."""
 OLD_MESSAGES_MAX: Final = 10
-"""Old messages in a row, each after the one before, that may have been delayed; one more: a
-restart."""
+"""Most old messages in a row, each newer than the last, that count as delayed. With one more the
+sender has restarted."""
 
 _log = logging.getLogger(__name__)
 
@@ -34,7 +34,7 @@ class MessageCounters(DatagramCounters):
 
     bad_messages: int = 0
     old_messages: int = 0
-    """Messages that came again or after a later one; dropped."""
+    """Messages that arrived twice or after a later one; dropped."""
     restarts: int = 0
     unknown_names: int = 0
     """Names that no joint or finger of a Shadow hand has; left out."""
@@ -49,7 +49,7 @@ class Stamp(NamedTuple):
     """Sender's own time, s, with any zero; None if the sender sends none."""
 
     def is_after(self, other: Stamp) -> bool:
-        """Return False if the number or the time, where both have it, is not after the other."""
+        """Return False if both have a number, or a time, and it is not after the other's."""
         pairs = zip(self, other, strict=True)
         return all(own is None or its is None or own > its for own, its in pairs)
 
@@ -97,7 +97,7 @@ def drop(data: bytes, why: object, counters: MessageCounters) -> None:
 def _message(data: bytes, key: str) -> Message:
     if len(data) > DATAGRAM_BYTES_MAX:
         raise ValueError(f"it is longer than {DATAGRAM_BYTES_MAX} bytes")
-    # JSON has no NaN; as text it costs only the value that has it.
+    # JSON has no NaN. As text it makes only its own value invalid.
     fields = json.loads(data.decode(), object_pairs_hook=_without_doubles, parse_constant=str)
     if not isinstance(fields, dict) or not isinstance(fields.get(key), dict):
         raise ValueError(f"it is not an object with an object `{key}`")
@@ -121,7 +121,7 @@ def number(value: object) -> float:
 
 
 class Order:
-    """Tells which messages of a sender are new, and counts those that are lost."""
+    """Finds which messages of a sender are new, and counts lost ones."""
 
     def __init__(self, counters: MessageCounters) -> None:
         self._counters = counters
@@ -131,7 +131,7 @@ class Order:
         self._old_in_a_row = 0
 
     def admits(self, stamp: Stamp) -> bool:
-        """Return True if the message is after those before, or the first of a new start."""
+        """Return True if the message is newer than all before, or the first after a restart."""
         if not stamp.is_after(self._last):
             if not self._has_restarted(stamp):
                 self._counters.old_messages += 1

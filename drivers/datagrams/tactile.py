@@ -28,7 +28,7 @@ from graspd.drivers.udp import DatagramDriver
 _log = logging.getLogger(__name__)
 
 LATE_NS: Final = 100_000_000
-"""Delay of a message, ns, from which it is counted as late: the usual age limit."""
+"""Delay from which on a message counts as late, ns: the usual age limit."""
 
 
 @dataclass(slots=True)
@@ -38,11 +38,11 @@ class TactileCounters(MessageCounters):
     other_hands: int = 0
     """Messages that name another hand; dropped."""
     late_messages: int = 0
-    """Messages that took 100 ms longer than the quickest before; handed over with that age."""
+    """Messages that took 100 ms longer than the quickest one; their readings have that age."""
     absent_fingers: int = 0
     """Fingers of the hand that a message lacks, or with all counts 0 or all 4095."""
     wrong_sizes: int = 0
-    """Fingers without 24 counts: of another sensor."""
+    """Fingers with another number of counts than 24, from another sensor."""
     bad_counts: int = 0
     """Values that are not a whole number in 0..4095."""
 
@@ -62,8 +62,8 @@ class TactileStream:
         self._interrupted = False
 
     def interrupt(self) -> None:
-        """Let the next reading not continue those before. The order of messages is kept, so that
-        no old one is mistaken for new."""
+        """Mark the next reading as interrupted. The last number and time stay, so that no old
+        message is mistaken for new."""
         self._interrupted = self.counters.readings > 0
 
     def receive(self, data: bytes, t_ns: int) -> list[TactileReading] | None:
@@ -115,7 +115,7 @@ class TactileStream:
         return TactileReading(t_ns, seq, counts, faults, interrupted=interrupted)
 
     def _counts(self, values: object) -> list[int | None] | None:
-        """Return the counts of a finger, None where it is none; None if it has no sensor."""
+        """Return the counts of a finger, with None for other values; None if it has no sensor."""
         if values is None:
             self.counters.absent_fingers += 1
             return None

@@ -1,7 +1,8 @@
 """A hand's calibration: convert raw Hall values of a palm packet to joint angles.
 
 A calibration file is TOML, as `deploy/calibration/example_hand.toml`. `[joints]` has points of
-[raw, degrees] for each joint, 2 to 64 in any order; of two sensors, as of THJ5, raw is the mean.
+[raw, degrees] for each joint, 2 to 64 in any order. If a joint has two sensors, as THJ5 does, raw
+is their mean.
 `[coupled]` has THJ1_THJ2, points of [raw THJ1, raw THJ2, degrees, degrees]; it is optional, but
 without it THJ1 and THJ2 have no angle.
 
@@ -38,7 +39,7 @@ HALL_SENSORS: Final = {
     "WRJ1": (23, 24),
     "WRJ2": (25,),
 }
-"""Indices in `PalmPacket.sensors` of each joint; of two sensors the mean is used."""
+"""Indices in `PalmPacket.sensors` of each joint's sensors; of two the mean is used."""
 COUPLED = ("THJ1", "THJ2")
 """Joints whose angles come from the raw values of both."""
 SUMS: Final = {f"{finger}J0": (f"{finger}J1", f"{finger}J2") for finger in ("FF", "MF", "RF", "LF")}
@@ -61,7 +62,7 @@ RANGE_DEG: Final[Mapping[str, tuple[int, int]]] = {
 }
 """Lowest and highest angle of each joint, degrees (Shadow's documentation, ranges)."""
 RANGE_MARGIN_DEG = 10
-"""Degrees beyond its range from which an angle shows a wrong calibration or sensor."""
+"""Degrees beyond a joint's range from which on calibration or sensor must be wrong."""
 
 VERSION = 1
 COUPLED_KEY = "THJ1_THJ2"
@@ -75,10 +76,8 @@ SLOPE_MAX_DEG = 0.5
 """Steepest allowed segment, degrees per count; usual are 0.03 to 0.1."""
 
 SHEAR: Final = np.array([[1.0, 1e-5], [0.0, 1.0 + 1.618e-5]])
-"""Change of raw pairs after which no square has its corners on one circle.
-
-With two ways to cut a square, the angles would jump where one takes over from the other.
-"""
+"""Shear of raw pairs after which no square has its corners on one circle. A square could be cut in
+two ways, and the angles would jump from one to the other."""
 
 Points = Sequence[Sequence[float]]
 """Rows of (raw, degrees), or of (raw THJ1, raw THJ2, degrees THJ1, degrees THJ2)."""
@@ -176,7 +175,7 @@ def _delaunay(points: NDArray[np.float64]) -> NDArray[np.intp]:
     edges = np.stack([b - a, c - a], axis=1)
     broad = np.abs(np.linalg.det(edges)) > 0.5  # twice the area; 0 on a line
     triples, a, edges = triples[broad], a[broad], edges[broad]
-    # The circle's centre is as far from the first corner as from the others.
+    # The circle's centre is equally far from all three corners.
     offset = np.linalg.solve(edges, (edges**2).sum(axis=2, keepdims=True) / 2)[:, :, 0]
     distance = np.linalg.norm(points - (a + offset)[:, None, :], axis=2)
     radius = np.linalg.norm(offset, axis=1, keepdims=True)
@@ -309,7 +308,8 @@ def _degree_problems(joint: str, degrees: Sequence[float]) -> Iterator[str]:
 
 
 def _steepness_problems(pairs: Iterable[tuple[Sequence[float], Sequence[float]]]) -> Iterator[str]:
-    """Yield the mistakes of pairs of points; the first half of a point is raw values."""
+    """Yield mistakes for pairs of points with too steep a slope. The first half of a point is raw
+    values, the second half angles in degrees."""
     for first, second in pairs:
         half = len(first) // 2
         distance = math.dist(first[:half], second[:half])

@@ -21,7 +21,7 @@ CYCLE_NS = 1_000_000
 SENSORS = 37
 """Number of words in `sensors`; 0..25 are Hall sensors (`graspd.drivers.palm.calibration`)."""
 MOTOR_BYTES: Final = 8 + 10 * 4
-"""Bytes behind `which_motors`: two masks, and records of the even or odd ones of 20 motors."""
+"""Bytes after `which_motors`: two masks, and records of the 10 even or 10 odd motors."""
 TACTILE_FINGERS = 5
 """Number of tactile slots, in the order of `graspd.biotac.FINGERS`."""
 
@@ -32,18 +32,18 @@ COMMAND_MAX = 4
 """Largest known `command`. 2 to 4 are service modes, whose `sensors` are not joints."""
 
 ROUND = 14
-"""Packets of a round: after them each channel of a BioTac has been sent once."""
+"""Packets of a round, in which each channel of a BioTac is sent once."""
 TYPE_METADATA_FIRST: Final = 0xFFF9
 TYPE_METADATA_LAST: Final = 0xFFFF
-"""Last of the types whose `tactile` holds serial numbers and versions instead of samples."""
+"""Last `tactile_type` whose `tactile` has serial numbers and versions instead of samples."""
 
 VALID_OTHER_0, VALID_OTHER_1 = 4, 8
-"""Bits of `TactileSlot.valid` for the two changing values; 1 and 2 are for the PAC words."""
+"""Bits of `TactileSlot.valid` for `other_0` and `other_1`; bits 1 and 2 are for PAC words."""
 VALID_ALL = 0x0F
 
 
 class Channel(NamedTuple):
-    """Channel of a slot's changing value; `electrode` is 0..23, None for other channels."""
+    """Channel of `other_0` or `other_1`; `electrode` is 0..23, None for other channels."""
 
     name: str
     electrode: int | None
@@ -123,15 +123,15 @@ class PalmCounters(DatagramCounters):
     """Packets that the palm was too late to fill."""
     service_packets: int = 0
     nonsense_packets: int = 0
-    """Packets with a value in a field that no palm sends."""
+    """Packets with a field that has a value which no palm sends."""
     lost_packets: int = 0
     """Packets missing from rounds that were handed over."""
     duplicate_packets: int = 0
-    """Packets that came again; the copy is dropped."""
+    """Packets that arrived twice; the copy is dropped."""
     reordered_packets: int = 0
-    """Packets that came after a later one, but in time for their round."""
+    """Packets that arrived after a later one, but in time for their round."""
     late_packets: int = 0
-    """Packets that came when their round was over; dropped."""
+    """Packets that arrived when their round was over; dropped."""
     conflicting_packets: int = 0
     """Packets for a place that another packet had taken; both are dropped."""
     unsynchronised_packets: int = 0

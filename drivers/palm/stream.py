@@ -1,7 +1,7 @@
 """A Shadow hand's palm: its packets, by UDP from a relay, become tactile and joint readings.
 
 A packet carries two channels of each BioTac; its `tactile_type` names them. Packets have no number,
-so the place of a packet is its type, counted on from the furthest packet before it:
+so the place of a packet follows from its type and the furthest packet before it:
 
 - A lost packet leaves its one or two electrodes `MISSING` in this round, and moves no others. A
   round that lacks packets is handed over when the first packet of the next round arrives.
@@ -10,9 +10,9 @@ so the place of a packet is its type, counted on from the furthest packet before
   that stands still). Both are dropped, and the place is `MISSING`.
 - Lost whole rounds are noticed by time alone, `LATE_MAX` cycles after a packet was due.
 
-Packets have no checksum; that of UDP covers the way from the relay. Two kinds of earlier damage are
-not noticed: a changed value in 0..4095 whose validity bit is set, and a changed `tactile_type` that
-names the place of a packet lost in the same round. Two hands of one kind that share a relay's
+Packets have no checksum; UDP's own covers only the way from the relay. Two kinds of earlier damage
+are not noticed: a changed value in 0..4095 whose validity bit is set, and a changed `tactile_type`
+that names the place of a packet lost in the same round. Two hands of one kind that share a relay's
 socket look like one, so use one port for each hand.
 """
 
@@ -59,11 +59,11 @@ LATE_MAX: Final = 10
 """Most cycles by which a packet may be late; after that a whole round counts as lost."""
 
 SPARE_CYCLES: Final = 2
-"""Cycles before the end of a round from which the driver waits for packets again."""
+"""Number of cycles before the end of a round at which the driver waits for packets again."""
 
 _COMPLETE: Final = (1 << ROUND) - 1
 _TELLING: Final = 0b11
-"""Bits of the packets with pressure and temperature, which show an absent sensor."""
+"""Bits of the round's positions with pressure and temperature, which show an absent sensor."""
 
 
 class PalmStream:
@@ -113,7 +113,7 @@ class PalmStream:
             from graspd.drivers.palm.calibration import load_calibration
 
             self._calibration = load_calibration(calibration)
-            counts = range(SENSORS)  # any valid values
+            counts = range(SENSORS)  # any valid raw values
             self._uncalibrated = int(np.isnan(self._calibration.angles_rad(counts)).sum())
 
     @property
@@ -239,7 +239,7 @@ class PalmStream:
                 self._put(row, second.electrode, values.other_1, fresh=fresh)
 
     def _put(self, row: int, electrode: int | None, value: int, *, fresh: bool) -> None:
-        if electrode is None:  # pressure and temperature only show if a sensor is present
+        if electrode is None:  # pressure or temperature: shows if a sensor is present
             self._absent[row] |= fresh and value > COUNT_MAX
         elif not fresh:
             self.counters.held_values += 1
@@ -276,7 +276,7 @@ class PalmStream:
         return TactileReading(self._t_ns, self._round, counts, faults, interrupted=interrupted)
 
     def _drop_absent_fingers(self) -> None:
-        """Flag fingers without a sensor: they show unwritten memory, no counts or only zeros."""
+        """Flag fingers without a sensor: their words are unwritten memory, no counts or zeros."""
         silent: NDArray[np.bool_] = ((self._counts == 0) & (self._faults == 0)).all(axis=1)
         absent = np.array(self._absent)
         if self._have & _TELLING != _TELLING:
@@ -336,7 +336,7 @@ class PalmDriver(DatagramDriver[PalmStream]):
         )
 
     def fileno(self) -> int | None:
-        """Return the socket; None while no round can end, for 71 wakes a second, not 1000."""
+        """Return the socket; None while no round can end, for 71 instead of 1000 wakes a second."""
         return None if self._clock() < self._attention_ns else super().fileno()
 
     def due_ns(self) -> int | None:

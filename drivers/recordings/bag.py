@@ -53,9 +53,9 @@ DEFINITIONS: Final = {
 }
 """Messages as Shadow publishes them, for bags that do not hold their definitions."""
 LOOKED_AT: Final = 20
-"""Messages that say which fingers have a sensor."""
+"""Number of messages from which it is decided which fingers have a sensor."""
 REPEAT_NS: Final = 1_000_000_000
-"""A message older than the one before by up to this is a repeat; by more, the clock was set."""
+"""Largest step back in time of a repeated message, ns. After a larger one the clock was set."""
 CHUNK_MAX_BYTES: Final = 256 << 20
 """Largest unpacked chunk, bytes; `rosbag record` ends one at 768 KiB, not within a message."""
 
@@ -63,7 +63,7 @@ _UNPACKERS: Final[dict[Callable[[bytes], bytes], Callable[[], Any]]] = {
     bz2.decompress: bz2.BZ2Decompressor,
     lz4.frame.decompress: lz4.frame.LZ4FrameDecompressor,
 }
-"""Bounded unpackers by those of rosbags, which have no bound."""
+"""Bounded unpackers, by the unbounded function of rosbags that each replaces."""
 _zstd: Final[Any] = vars(rosbag2.reader)["zstd"]
 _DAMAGE = (
     *(
@@ -86,7 +86,7 @@ class BagCounters(DriverCounters):
     """Counters of a replay."""
 
     repeats: int = 0
-    """Messages of the time or with the very counts of the one before, which were dropped."""
+    """Messages with the time or the counts of the one before; dropped."""
     malformed: int = 0
     """Messages without five sensors."""
 
@@ -190,11 +190,11 @@ class _Bag:
         self.tactile = tactile
         hand = tactile.topic.strip("/").partition("/")[0]
         self._others = tuple(f"{other}_" for other in HANDS if hand in HANDS and other != hand)
-        """Begin of the names of another hand's joints."""
+        """Prefixes of the names of another hand's joints."""
         self.joints = self._choose(JOINTS)
 
     def _choose(self, kind: str) -> Connection | None:
-        """Return the topic of this type; of several the one of the right hand, or the shortest."""
+        """Return the topic of this type: of several the right hand's, or else the shortest."""
         found = [each for each in self._reader.connections if each.msgtype == kind]
         found.sort(key=lambda each: (not each.topic.startswith("/rh/"), len(each.topic)))
         if kind == JOINTS:
@@ -247,7 +247,7 @@ def _opened(path: Path) -> Iterator[_Bag]:
 
 
 def _reader_of(path: Path) -> Any:  # noqa: ANN401
-    """Return a reader of ROS 2; rosbags knows a file by its suffix alone."""
+    """Return a reader of a ROS 2 bag. rosbags itself goes by the suffix of the file."""
     if path.is_dir():
         return rosbag2.Reader(path)
     with path.open("rb") as file:
@@ -256,7 +256,7 @@ def _reader_of(path: Path) -> Any:  # noqa: ANN401
 
 
 def _bound(reader: rosbag1.Reader) -> None:
-    """Let a packed chunk be an error if it unpacks to more than `CHUNK_MAX_BYTES`."""
+    """Make the reader raise for a chunk that unpacks to more than `CHUNK_MAX_BYTES`."""
     for place, chunk in reader.chunks.items():
         if chunk.decompressor in _UNPACKERS:
             unpack = partial(_unpacked, _UNPACKERS[chunk.decompressor])
@@ -272,7 +272,7 @@ def _unpacked(make: Callable[[], Any], packed: bytes) -> bytes:
 
 
 def _bound_ros2() -> None:
-    """Let rosbags unpack ROS 2 bags by bounded functions; its own have no bound."""
+    """Replace the unbounded functions by which rosbags unpacks ROS 2 bags."""
     bounded = SimpleNamespace(**vars(_zstd))
     bounded.decompress = partial(_unpacked, _zstd.ZstdDecompressor)
     bounded.open = lambda file, _mode: Unpacked(file, _zstd.open(file))
@@ -322,7 +322,7 @@ def sensors_of(path: Path, message: Any) -> NDArray[np.int64] | None:  # noqa: A
 
 
 def fingers_of(path: Path) -> tuple[Finger, ...]:
-    """Return the fingers with a sensor: an absent one has values at a rail, or no counts."""
+    """Return the fingers with a sensor; an absent sensor has values at a rail, or no counts."""
     seen = np.zeros(len(FINGERS), dtype=np.intp)
     number = 0
     with _opened(path) as bag:
@@ -350,11 +350,11 @@ def has_joints(path: Path) -> bool:
 
 
 def _joints(t_ns: int, message: Any) -> JointReading | None:  # noqa: ANN401
-    """Return the angles of a hand's joints; None: there is none."""
+    """Return the angles of a hand's joints in a message; None: it has none."""
     angles: dict[str, float] = {}
     for name, angle in zip(message.name, message.position, strict=False):
         if joint := joint_name(name):
-            # `rh_FFJ3` beside `lh_FFJ3` is one joint with two angles: neither is trusted.
+            # `rh_FFJ3` and `lh_FFJ3` are one joint with two angles, of which neither is trusted.
             angles[joint] = math.nan if joint in angles else float(angle)
     if not angles:
         return None

@@ -1,7 +1,7 @@
 """CAN logs of other programs, read by python-can: ASC and BLF of Vector, TRC of PEAK.
 
-Its readers skip lines in silence, end at the first one that is damaged, take half a byte for a
-whole one, and do not know ASC files whose times are since the line before. Each line is therefore
+Its readers skip lines in silence, end at the first damaged one, read half a byte as a whole one,
+and do not support ASC files whose times are relative to the line before. Each line is therefore
 read alone, and compared with the message. Files number channels from 1: channel 1 is `can0`.
 """
 
@@ -19,14 +19,12 @@ from graspd.drivers.can.frames import CLASSIC_DATA_MAX, ERR_FLAG, EXTENDED_ID_MA
 from graspd.drivers.recordings.candump import NO_BUS, NS_PER_S, Line, Logged, frame_of
 
 BUS_ERROR: Final = 0x80
-"""Class of an error frame of which a log keeps nothing (linux/can/error.h)."""
+"""Error class given to an error frame whose class the log lacks (linux/can/error.h)."""
 HEADER_LINES_MAX: Final = 100
 """Most lines of a header; those of TRC files have 30."""
 PIECE_BYTES_MAX: Final = 1 << 19
-"""Longest piece of a BLF file, bytes; Vector's have 128 KiB before they are packed.
-
-A piece unpacks to a thousand times its length at most.
-"""
+"""Longest piece of a BLF file, bytes; Vector's have 128 KiB before they are packed. A piece unpacks
+to at most a thousand times its length."""
 FD_FLAG: Final = 0x1000
 """Flag of a CAN FD frame in lines `CANFD` of ASC files, which have classic frames too."""
 
@@ -86,7 +84,7 @@ def read_trc(lines: Iterable[str]) -> Iterator[Line]:
 
 
 def read_csv(lines: Iterable[str]) -> Iterator[Line]:
-    """Yield frames of a CSV file of python-can, which has one bus, and strange lines."""
+    """Yield frames of a CSV file of python-can, which has one bus, and lines not understood."""
     for number, text in enumerate(lines, 1):
         if number > 1 and text.strip():
             message = _message(can.CSVReader, ["", text])
@@ -96,7 +94,7 @@ def read_csv(lines: Iterable[str]) -> Iterator[Line]:
 
 
 def read_blf(stream: BinaryIO) -> Iterator[Line]:
-    """Yield frames of a BLF file, and where it is damaged; what follows cannot be found."""
+    """Yield frames of a BLF file up to damage, which ends it: later frames cannot be found."""
     number = 0
     try:
         for number, message in enumerate(can.BLFReader(cast(BinaryIO, _Pieces(stream))), 1):
@@ -108,7 +106,7 @@ def read_blf(stream: BinaryIO) -> Iterator[Line]:
 def _message(
     reader: Callable[[TextIO], Iterable[can.Message]], lines: list[str]
 ) -> can.Message | None:
-    """Return the message in these lines, of which the last may be a frame; None: it is not one."""
+    """Return the message in the last of these lines; None: that line is not a frame."""
     try:
         return next(iter(reader(cast(TextIO, _Lines(lines)))), None)
     except _DAMAGE:
@@ -116,10 +114,8 @@ def _message(
 
 
 def _logged(message: can.Message | None, text: str, first_channel: int = 0) -> Logged | None:
-    """Return what a message has; None if it is not what its line says, or says half.
-
-    `text`: the line, if it has the data in hexadecimal digits.
-    """
+    """Return the frame of a message; None if it differs from its line or is incomplete. `text`: the
+    line, if it has the data in hexadecimal digits."""
     if message is None or not isinstance(message.channel, int):
         return None
     t_ns, bus = round(message.timestamp * NS_PER_S), f"can{message.channel - first_channel}"
@@ -150,7 +146,7 @@ def _is_classic(text: str, data_bytes: int) -> bool:
 
 
 class _Lines:
-    """A few lines as python-can reads them from a file."""
+    """Lines in the form of the text file that python-can reads."""
 
     def __init__(self, lines: Iterable[str]) -> None:
         self._lines = iter(lines)
@@ -166,7 +162,7 @@ class _Lines:
 
 
 class _Pieces:
-    """A file of which no long piece is read at once, however long it says to be."""
+    """A file whose reads are limited, whatever length a piece of it claims to have."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream

@@ -32,7 +32,7 @@ from graspd.drivers.recordings.player import LinkLogDriver
 
 NS_PER_US: Final = 1000
 FIRST_LINES: Final = 20_000
-"""Lines by which the bus is chosen, 5 s of a bus that is full; they are kept meanwhile."""
+"""Number of first lines by which the bus is chosen: 5 s of a full bus."""
 IDS_MAX: Final = 4096
 """Most pairs of bus and id that are counted; standard frames of one bus have half as many."""
 SHOWN_MAX: Final = 8
@@ -40,9 +40,9 @@ SHOWN_MAX: Final = 8
 SHOWN_LENGTH_MAX: Final = 80
 """Most characters of a line in a message."""
 SET_BACK_NS: Final = 1_000_000_000
-"""Fall of the time, ns, from which on the clock was set or another log begins."""
+"""Fall of the time from which on the clock was set or another log begins, ns."""
 STEPS_SHARE: Final = 0.5
-"""Falls of the time for each rise, from which on times are steps, which fall as often as rise."""
+"""Ratio of falls to rises of the time from which on times are steps since the line before."""
 
 _TEXTS: Final = {
     Kind.CANDUMP: read_candump,
@@ -67,7 +67,7 @@ def line_of(frame: CanFrame, wall_ns: int, channel: str) -> str:
 
 
 def encode_frames(frames: Sequence[Stamped], offset_ns: int, channel: str) -> bytes:
-    """Return frames as lines; `offset_ns`: wall time less their time."""
+    """Return frames as lines; `offset_ns`: wall time less monotonic time."""
     lines = [
         line_of(frame, max(until_ns + offset_ns, 0), channel)
         for frame, _, until_ns in frames
@@ -82,7 +82,7 @@ def bus_name(channel: str) -> str:
 
 
 def read_log(path: Path) -> Iterator[Line]:
-    """Yield what a CAN log of any kind has. Raises `RecordingError`."""
+    """Yield the lines of a CAN log of any kind. Raises `RecordingError`."""
     kind = kind_of(path)
     with open_recording(path) as stream:
         if kind is Kind.BLF:
@@ -107,20 +107,20 @@ def _lines(stream: BinaryIO) -> Iterator[str]:
 
 @dataclass(slots=True)
 class Survey:
-    """The begin of a log, by which its bus is chosen; the log is read once."""
+    """The first lines of a log, by which its bus is chosen; the log is read only once."""
 
     lines: Iterator[Line]
-    """The whole log."""
+    """All lines of the log, the first ones included."""
     strange: str = ""
     """The first line that was not understood, with its number."""
     frames: Counter[tuple[str, int | None]] = field(default_factory=Counter)
-    """Frames of a bus and arbitration id; None: CAN FD."""
+    """Number of frames by bus and arbitration id; id None: CAN FD."""
     has_steps: bool = False
-    """True if times are since the line before (`candump -td`, ASC with relative times)."""
+    """True if times count from the line before (`candump -td`, ASC with relative times)."""
 
     @classmethod
     def of(cls, path: Path) -> Survey:
-        """Read the begin of a log. Raises `RecordingError`."""
+        """Read the first lines of a log. Raises `RecordingError`."""
         log = read_log(path)
         first = list(islice(log, FIRST_LINES))
         survey, last_ns, rises, falls = cls(chain(first, log)), dict[str, int](), 0, 0
@@ -161,10 +161,8 @@ class CanLog(LinkLogDriver[CanFrame]):
         clock: Callable[[], int] = time.monotonic_ns,
         **board: Unpack[BoardOptions],
     ) -> None:
-        """`channel`: the bus to play, of logs of several. Others: of `RecordedDriver`, `CanStream`.
-
-        Raises `ValueError`.
-        """
+        """`channel`: bus to play if the logs have several. Others: see `RecordedDriver`,
+        `CanStream`. Raises `ValueError`."""
         super().__init__(paths, speed, clock)
         self._fingers, self._board = fingers, board
         self._channel = None if channel is None else bus_name(channel)
@@ -174,7 +172,7 @@ class CanLog(LinkLogDriver[CanFrame]):
         self.begin()
 
     def open(self) -> None:
-        """Read the begin of the logs to choose the bus, then start."""
+        """Read the first lines of the logs to choose the bus, then start."""
         self.close()
         self._surveys = {path: Survey.of(path) for path in self.paths}
         frames: Counter[tuple[str, int | None]] = Counter()
@@ -206,7 +204,8 @@ class CanLog(LinkLogDriver[CanFrame]):
         return self._channel
 
     def _check_ids(self, frames: Counter[tuple[str, int | None]]) -> None:
-        """Warn if no frame of the bus has the board's arbitration id; raise if all are CAN FD."""
+        """Warn if no frame has the board's arbitration id. Raise `RecordingError` if all are CAN
+        FD."""
         wanted = self._board.get("arbitration_id")
         ids = {key[1]: count for key, count in frames.items() if key[0] == self._bus}
         if set(ids) == {None}:
@@ -249,7 +248,7 @@ class CanLog(LinkLogDriver[CanFrame]):
             _log.warning(text, path, strange, lines, first)
 
     def _going_on(self, t_ns: int) -> int:
-        """Return a time that does not fall where the clock was set back: the link was silent."""
+        """Return `t_ns`, raised so that it never falls where the log's clock was set back."""
         t_ns += self._shift_ns
         if t_ns < self._last_ns - SET_BACK_NS:
             self._shift_ns += self._last_ns + SET_BACK_NS - t_ns

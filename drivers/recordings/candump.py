@@ -2,11 +2,11 @@
 
 In a file: `(1436509052.249713) can0 100#0D3A1F`: seconds, bus, id of three or eight digits, data.
 On a terminal: ` (1436509052.249713)  can0  100   [3]  0D 3A 1F   '.:.'`. The time has any number
-of decimals. With `-ta` and `-tA` it is since 1970, with `-tz` since the first frame, and with `-td`
-since the frame before. A remote frame has `R` or `remote request` instead of data, a frame of
+of decimals. It counts from 1970 with `-ta` and `-tA`, from the first frame with `-tz`, and from the
+frame before with `-td`. A remote frame has `R` or `remote request` instead of data, a frame of
 CAN FD `##` or a length of two digits. Bit 29 of an id marks an error frame (can-utils: candump.c,
-lib.c; linux/can.h). python-can's own reader drops the classes of an error frame, reads most as
-data, takes half a byte for a whole one, and ends at the first line that is not a frame.
+lib.c; linux/can.h). python-can's own reader drops the classes of error frames, reads most of these
+as data, reads half a byte as a whole one, and ends at the first line that is not a frame.
 """
 
 from __future__ import annotations
@@ -51,28 +51,28 @@ _LINE: Final = re.compile(
 _DROPS: Final = re.compile(
     r"DROPCOUNT: dropped \d+ CAN frames? on '([^',]*)[^']*' socket.*", re.ASCII
 )
-"""Line of `candump -d` where the kernel dropped frames."""
+"""Line that `candump -d` writes where the kernel dropped frames."""
 _COLOUR: Final = re.compile(r"\x1b\[[0-9;]*m")
 ANY_BUS: Final = "any"
-"""Bus of a loss that is of all of them."""
+"""Name of the bus for a loss on all buses."""
 NO_BUS: Final = ""
-"""Bus of a line that is not a frame, and whose time counts."""
+"""Name of the bus for a line without a frame whose time matters."""
 
 
 class Logged(NamedTuple):
     """A frame of a CAN log with its time and bus."""
 
     t_ns: int | None
-    """Time by the log's clock, ns; None: that of the frame before."""
+    """Time by the log's clock, ns; None: the same as that of the frame before."""
     bus: str
     frame: CanFrame | None
-    """None: a frame of CAN FD."""
+    """Classic frame; None: a CAN FD frame."""
     may_be_step: bool = False
-    """True if the time may be that since the frame before."""
+    """True if the time may count from the frame before."""
 
 
 Line = tuple[int, str, Logged | None]
-"""A line's number and text, and what it has; None: it was not understood."""
+"""Number and text of a line, and the frame in it; None: not understood."""
 
 
 def read_candump(lines: Iterable[str]) -> Iterator[Line]:
@@ -83,7 +83,7 @@ def read_candump(lines: Iterable[str]) -> Iterator[Line]:
 
 
 def parse(text: str) -> Logged | None:
-    """Return what a line has; None if it is not one of candump."""
+    """Return the frame in a line; None if candump writes no such line."""
     if "\x1b" in text:
         text = _COLOUR.sub("", text)
     found = _LINE.fullmatch(text)
@@ -110,7 +110,7 @@ def _time_of(found: re.Match[str]) -> int | None:
 
 
 def _frame_of(found: re.Match[str]) -> CanFrame | None:
-    """Return the frame of a line; None for an id or length that cannot be."""
+    """Return the frame of a line; None for an impossible id or length."""
     digits = found["id"] or found["shown_id"]
     data = bytes.fromhex(found["data"] or found["shown"] or "")
     is_remote = bool(found["remote"] or found["shown_remote"])
@@ -120,7 +120,10 @@ def _frame_of(found: re.Match[str]) -> CanFrame | None:
 
 
 def frame_of(word: int, data: bytes, *, is_long: bool, is_remote: bool) -> CanFrame | None:
-    """Return a frame; None for an id that cannot be. `is_long`: the id is of 29 bits."""
+    """Return the frame of `word`, id and flags; None for an impossible id.
+
+    `is_long`: the id has 29 bits.
+    """
     flags = REMOTE if is_remote else 0
     if is_long:
         flags |= ERROR if word & ERR_FLAG else EXTENDED

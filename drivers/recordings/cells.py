@@ -1,4 +1,4 @@
-"""Cells of a table file, text or Parquet, whatever its dialect."""
+"""Cells of a table file: Parquet, or text with any separator and encoding."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from graspd.extras import needs
 
 _SEPARATORS: Final = ",;\t|"
 _SEPARATOR_LINE: Final = re.compile(r"sep=(.)", re.IGNORECASE)
-"""First line by which a spreadsheet tells the separator."""
+"""First line in which a spreadsheet program names the separator."""
 TITLE_LINES_MAX: Final = 30
-"""Most lines above the header, blank ones apart."""
+"""Most lines above the header, not counting blank ones."""
 
 
 class Cells:
@@ -44,13 +44,13 @@ class Cells:
         """`file`: opened, at its start."""
         self._path = path
         self.line = 0
-        """Number of the last line that was read, from 1; of Parquet, of the row."""
+        """Number of the last line read, from 1; for Parquet, of the last row."""
         self.has_end = True
         """False after a last line without a line end."""
         self.decimal_comma = False
-        """True if numbers may have a comma for a point."""
+        """True if numbers may have a decimal comma."""
         self._length = 0
-        """Characters of the row that is read, so far."""
+        """Number of characters read so far of the current row."""
         kind = kind_of_open(path, file)
         if kind not in TABLES:
             raise RecordingError(path, f"is {kind.value}, not a table or stream")
@@ -75,7 +75,7 @@ class Cells:
                 yield cells
 
     def error(self, problem: str, column: str | None = None) -> RecordingError:
-        """Return an error of the line that was read last."""
+        """Return an error that names the line that was read last."""
         if not self.has_end:
             problem += "; the file ends here without a line end, so it may be cut off"
         return RecordingError(self._path, problem, line=self.line or None, column=column)
@@ -108,10 +108,8 @@ class Cells:
             raise self.error(f"this is not CSV: {error}") from error
 
     def _header(self, lines: Iterator[str]) -> tuple[str, list[str], Iterator[str]]:
-        """Return the separator, one line of the header or two, and the lines below.
-
-        Without electrodes in one of the first lines it is the first.
-        """
+        """Return the separator, one line of the header or two, and the lines below. If no line at
+        the begin names electrodes, the header is the first line."""
         separator, comment, above, titles = "", "", "", list[tuple[int, str]]()
         header, below = list[str](), list[str]()
         while not header and len(titles) < TITLE_LINES_MAX and (line := next(lines, "")):
@@ -138,10 +136,8 @@ class Cells:
         return separator or _separator(header[-1]), header, chain(below, lines)
 
     def _row_lines(self, lines: Iterator[str], separator: str, number: int) -> Iterator[str]:
-        """Yield lines without comments; a row of several lines is as long as a line may be.
-
-        `number`: separators of the header.
-        """
+        """Yield rows as lines, without comments. A row of several lines has the length limit of a
+        line. `number`: number of separators in the header."""
         for line in lines:
             if self._length == 0 and line.startswith("#"):
                 is_row = separator != " " and line.count(separator) >= number
@@ -160,7 +156,7 @@ class Cells:
         """Yield the lines of text with their ends: line feed, carriage return or both."""
         encoding = encoding_of(file.read(HEAD_BYTES)) or "utf-8"
         file.seek(0)
-        # A byte that is not UTF-8 becomes a surrogate, so that its line is known.
+        # A byte that is not UTF-8 becomes a surrogate, so that an error can name its line.
         errors = "surrogateescape" if encoding.startswith("utf-8") else "strict"
         text = io.TextIOWrapper(file, encoding, errors, newline="")
         try:
@@ -200,7 +196,7 @@ class Cells:
 
 
 def _separator(header: str) -> str:
-    """Return what separates the cells of a header."""
+    """Return the character that separates the cells of a header."""
     most = max(_SEPARATORS, key=header.count)
     return most if most in header else " "
 
@@ -214,7 +210,7 @@ def _names_fingers(line: str) -> bool:
 
 
 def _merged(above: Sequence[str], names: Sequence[str]) -> list[str]:
-    """Return names with the finger above them; one counts until the next."""
+    """Return names prefixed by the finger above them, which applies until the next finger."""
     merged, finger = list[str](), ""
     for top, name in zip_longest(above, names, fillvalue=""):
         finger = top.strip() or finger

@@ -37,9 +37,9 @@ SCHEMES: Final[Mapping[str, re.Pattern[str]]] = {
         "E1": rf"{_ELECTRODE}{_NUMBER}",
     }.items()
 }
-"""Names of electrodes, each scheme by an example; the first that a file has is read. The fourth is
-that of Shadow's message BiotacAll, of ff, mf, rf, lf, th. The fifth, of BioTacHand, names no
-finger, and the last one is of a single finger."""
+"""Patterns of electrodes' names, each by an example; the first that a file has is read. The fourth
+is of Shadow's message BiotacAll, for ff, mf, rf, lf, th. The fifth, of BioTacHand, names no finger,
+and the last one is for a single finger."""
 
 ONE_ROW: Final = "put all fingers into one row, as ff_e1 and mf_e1"
 HEADER_ELECTRODES_MIN: Final = 12
@@ -67,7 +67,7 @@ _TIME_NAME: Final = re.compile(
 )
 _IN_UNIT: Final = re.compile(rf"(?P<before>.*)[(\[](?P<unit>{_UNITS})[)\]]", re.IGNORECASE)
 _UNIT: Final = re.compile(r"\s*[(\[]([^\W\d][^)\]]*|-)[)\]]")
-"""A unit behind the name of a column."""
+"""A unit in brackets after the name of a column."""
 _OF_A_FINGER: Final = re.compile(
     r"(?:finger(?:[_ ]?tip)?|digit|sensor|biotac|tip)(?:[_ ]?(?:name|id|no|nr|index))?|frame_id",
     re.IGNORECASE,
@@ -76,7 +76,7 @@ UNITS: Final = frozenset((*_UNIT_S, "counts", "count", "raw", "adc", "lsb", "bit
 
 
 class MissingFingersError(RecordingError):
-    """A file lacks fingers that are asked for."""
+    """A file lacks fingers that were requested."""
 
     def __init__(
         self, path: Path, problem: str, line: int, column: str, there: Sequence[Finger]
@@ -93,7 +93,7 @@ class TimeColumn:
     name: str
     places: tuple[int, ...]
     unit_s: float | None
-    """Its unit, s, if the name tells it."""
+    """Unit of the times, s, if the column's name gives it; else None."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,8 +118,8 @@ class Columns:
     def of(cls, path: Path, names: Sequence[str], fingers: Sequence[str], line: int) -> Columns:
         """Return the columns to read for `fingers`; without any, for all that the file has.
 
-        `names`: the header, of this line. Raises `RecordingError` for what is missing or there
-        twice.
+        `names`: the header, at line `line`. Raises `RecordingError` for columns that are missing or
+        occur twice.
         """
         plain = [_UNIT.sub("", name) for name in names]
         found = _electrodes(path, plain, fingers, line)
@@ -135,7 +135,7 @@ class Columns:
         single: dict[str, int] = {}
         for place, name in enumerate(names):
             is_time = time is not None and name == time.name
-            if is_time or name.lower() in (OBJECT, SLIPPED):  # of any letters, as electrodes are
+            if is_time or name.lower() in (OBJECT, SLIPPED):  # in letters of any case
                 key = name if is_time else name.lower()
                 _refuse_twice(path, names, line, single.get(key), place)
                 single[key] = place
@@ -172,7 +172,7 @@ def is_electrode(name: str) -> bool:
 
 
 def with_units(names: Sequence[str], cells: Sequence[str]) -> list[str] | None:
-    """Return names with the units of the row below; None if that is a row of something else."""
+    """Return names with the units of the row below; None if the cells are not units."""
     units = [cell.strip("[]()- ") for cell in cells]
     given = {unit.lower() for unit in units} - {""}
     if not given or not given <= UNITS:
@@ -222,7 +222,7 @@ def _whole(
     fingers: Sequence[str],
     line: int,
 ) -> dict[str, dict[int, int]]:
-    """Return the electrodes by number from 0; raise if a finger that is asked for lacks some."""
+    """Return the electrodes by number from 0; raise if a requested finger lacks some."""
     base = min(1, *(min(numbers) for numbers in found.values()))
     is_named = found.keys() <= _PLACES.keys()
     for finger in fingers if fingers and is_named else found:
@@ -268,7 +268,7 @@ def _written(example: str, finger: str) -> str:
 
 
 def _nearest(names: Sequence[str]) -> str:
-    """Return the name that is most like one of a scheme, and the names that were looked for."""
+    """Return text on the name that is most like an electrode's, and the expected names."""
     from difflib import SequenceMatcher  # only where it is needed
 
     likeness = [

@@ -77,11 +77,9 @@ class ReplayDriver(ReadingsDriver[tuple[Row, bool]]):
         strict: bool = False,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """`layouts`: of the files, if they are known. `speed`: factor of real time; None: fast.
-
-        `rate_hz`: rows per second where there are no times; a table has 100. `read_as` and
-        `rate_hz` are also as of `layout_of`.
-        """
+        """`layouts`: layout of each file, if known. `speed`: factor of real time; None: fast.
+        `rate_hz`: rows per second of a file without times; a table has 100. `read_as`, `rate_hz`:
+        see `layout_of`."""
         super().__init__(paths, fingers, speed=speed, clock=clock)
         self._table_period_ns = _NS_PER_S / (rate_hz or TABLE_RATE_HZ)
         self._find = partial(layout_of, fingers=self._fingers, read_as=read_as, rate_hz=rate_hz)

@@ -52,7 +52,7 @@ class Recording:
     """The rows of one file. Iterate once.
 
     Iterating raises `RecordingError` for a wrong row. A value that is not a count makes its
-    electrode faulty; with `strict` it raises. An outcome that cannot be read is not known; with
+    electrode faulty; with `strict` it raises. An unreadable outcome counts as not known; with
     `outcomes` it raises.
 
     A count is an integer in 0..4095 in ASCII digits: `2602`, `2602.0` or `2.602e3`. A last row
@@ -118,7 +118,7 @@ class Recording:
         return np.array(counts, dtype=np.uint16).reshape(self._shape), faults
 
     def _unusual(self, text: str, place: int, faults: NDArray[np.uint8]) -> int:
-        """Return the count in a cell of unusual text; without one, 0 and a fault."""
+        """Return the count in a cell of unusual text; else 0, and set the fault at `place`."""
         count = count_of(text, decimal_comma=self._comma)
         if count is not None:
             return count

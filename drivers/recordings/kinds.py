@@ -30,9 +30,9 @@ COPIED_BYTES_MAX: Final = 4 * 2**30
 LINE_LENGTH_MAX: Final = 65_536
 """Longest line, characters; a full row has 1,200. A disk image may have no line end at all."""
 HEAD_BYTES: Final = 65_536
-"""Bytes of a file that decide what it is."""
+"""Number of first bytes that decide the kind of a file."""
 HEADER_BYTES: Final = 64
-"""Bytes whose zeros tell UTF-16 without a mark."""
+"""Number of first bytes in which zeros show UTF-16 without a byte order mark."""
 PAGE: Final = "deploy/RECORDING.md"
 
 
@@ -59,7 +59,7 @@ BAGS: Final = frozenset((Kind.ROS1_BAG, Kind.ROS2_BAG))
 _GZIP: Final = b"\x1f\x8b\x08"
 _MCAP: Final = b"\x89MCAP0\r\n"
 _MCAP_ROS2: Final = _MCAP + b"\x01", b"\x04\x00\x00\x00ros2"
-"""Begin of a file and of its profile, after the length of the header record."""
+"""First bytes of a file, and of its profile after the length of the header record."""
 _MAGIC: Final = {
     b"PAR1": Kind.PARQUET,
     _MCAP: Kind.MCAP,
@@ -128,11 +128,11 @@ _OTHERS: Final = {
 
 
 def kind_of(path: Path) -> Kind:
-    """Return what a file or folder holds.
+    """Return the kind of a file or folder.
 
     Raises `RecordingError` for what graspd does not read, and for a bag without the extra `bag`.
     """
-    if os.path.isfile(path / "metadata.yaml"):  # False too where it may not look
+    if os.path.isfile(path / "metadata.yaml"):  # also False without the right to look
         kind = Kind.ROS2_BAG
     else:
         with open_recording(path) as file:
@@ -146,7 +146,7 @@ def kind_of(path: Path) -> Kind:
 
 
 def kind_of_open(path: Path, file: BinaryIO) -> Kind:
-    """Return what an opened file holds, and rewind it. Raises `RecordingError`."""
+    """Return the kind of an opened file, and rewind it. Raises `RecordingError`."""
     try:
         head = file.read(HEAD_BYTES)
         file.seek(0)
@@ -163,7 +163,7 @@ def kind_of_open(path: Path, file: BinaryIO) -> Kind:
 
 
 def kind_of_all(paths: Sequence[Path]) -> Kind:
-    """Return what all these files hold; `Kind.TEXT` for tables of either form.
+    """Return the kind of all these files; `Kind.TEXT` for tables, also as Parquet.
 
     Raises `RecordingError` if they are not of one kind.
     """
@@ -177,7 +177,7 @@ def kind_of_all(paths: Sequence[Path]) -> Kind:
 
 
 def refuse_options(path: Path, kind: Kind, options: Mapping[str, object]) -> None:
-    """Raise `RecordingError` if options of tables, by name, are given for what is not one."""
+    """Raise `RecordingError` if `options`, which only tables have, are set for another kind."""
     given = [name for name, value in options.items() if value]
     if kind not in TABLES and given:
         problem = f"is {kind.value}, which is played as it is: no {', '.join(given)}"
@@ -210,7 +210,7 @@ def _kind_of(head: bytes) -> Kind | None:
 
 
 def encoding_of(head: bytes) -> str | None:
-    """Return the encoding of text, by its byte order mark or every other byte; None: UTF-8."""
+    """Return the encoding of text, by byte order mark or zeros in every other byte; None: UTF-8."""
     for mark, name in _MARKS.items():
         if head.startswith(mark):
             return name
@@ -249,10 +249,10 @@ def is_packed(path: Path) -> bool:
 
 
 class Unpacked(io.RawIOBase):
-    """The content of a packed file. A damaged one, or one that grows too much, is an `OSError`."""
+    """The content of a packed file. Reading raises `OSError` if it is damaged or too large."""
 
     def __init__(self, file: BinaryIO, packed: BinaryIO) -> None:
-        """`packed`: what unpacks `file`."""
+        """`packed`: stream that unpacks `file`."""
         self._file, self._packed = file, packed
 
     def readable(self) -> bool:
@@ -285,7 +285,7 @@ class Unpacked(io.RawIOBase):
 
 @contextmanager
 def files_of(paths: Sequence[Path]) -> Iterator[list[Path]]:
-    """Yield `paths` with a copy in place of what can be read only once: `-` and pipes.
+    """Yield `paths` with copies in place of `-` and pipes, which can be read only once.
 
     Raises `RecordingError` for more than `COPIED_BYTES_MAX`.
     """
@@ -297,7 +297,7 @@ def _file_of(path: Path, folder: Path) -> Path:
     try:
         is_pipe = path == STANDARD_INPUT or stat.S_ISFIFO(os.stat(path).st_mode)
     except (OSError, ValueError):
-        return path  # whatever opens it says why not
+        return path  # opening it will raise the error
     if not is_pipe:
         return path
     folder.mkdir()

@@ -1,7 +1,5 @@
-"""Table or stream: the rows of a file are grasps or sweeps, by its times or by the rows.
-
-A sweep of a stream is never judged as a grasp, so doubt is refused.
-"""
+"""Decide whether a file is a table of grasps or a stream of sweeps, by times or by its rows. A
+sweep of a stream is never judged as a grasp, so doubt is refused."""
 
 from __future__ import annotations
 
@@ -32,45 +30,47 @@ from graspd.drivers.recordings.values import (
 
 ReadAs = Literal["table", "stream"]
 BLOCK_ROWS: Final = 512
-"""Rows that are compared with each other, and rows at the begin whose values are checked."""
+"""Number of rows that are compared with each other, and of first rows that are checked."""
 CLIP_COUNTS: Final = 64.0
-"""Most by which one electrode counts: a broken one may have any value."""
+"""Largest difference of one electrode that counts, because a broken one may have any value."""
 NEAR_COUNTS: Final = 8.0
-"""Root of the mean square by which rows differ that nearly repeat each other, counts.
+"""Largest root mean square difference, counts, of rows that nearly repeat each other.
 
-Sweeps of a hand at rest differ by 3 to 6. At most 5 % of the published grasps are as near to
-another one, and 20 % of ten of one object; 33 to 61 % of the sweeps of streams at 4 to 100 Hz are.
+Sweeps of a hand at rest differ by 3 to 6. At most 5 % of the published grasps are that near to
+another one, and 20 % within ten of one object. In streams at 4 to 100 Hz 33 to 61 % are.
 """
 STEP_COUNTS: Final = 25.0
-"""The same of rows that may be sweeps in a row: 74 to 97 % of streams, 13 to 44 % of tables."""
+"""Largest difference of rows that may be successive sweeps, counts. In streams 74 to 97 % of rows
+are that near to another, in tables 13 to 44 %."""
 NEAR_SHARE_MAX: Final = 0.2
 """Largest share of rows up to `NEAR_COUNTS` from another in a grasp table."""
 ALIKE_SHARE_MAX: Final = 0.85
-"""Largest share of rows up to `STEP_COUNTS` from another, where near ones count twice: of sweeps
-with broken electrodes, or of much noise, up to 100 % are, and not one of them is near."""
+"""Largest share, in a grasp table, of rows up to `STEP_COUNTS` from another; rows within
+`NEAR_COUNTS` count twice. In noisy streams up to 100 % are within the former, none in the latter.
+"""
 DOUBTED_SHARES: Final = 0.1, 0.6
-"""The same shares where rows do not say that lifts ended both ways, as sweeps never do.
+"""The same two shares for rows without outcomes of both kinds, which may be sweeps.
 
-Pieces of 12 sweeps at 4 Hz have less in 2 %, and in 22 % less than the shares above; 12 published
-grasps in a row have more in 20 %, and any 12 in under 1 %.
+With 12 sweeps at 4 Hz, 2 % of pieces are below these shares, and 22 % below those above. With 12
+published grasps, 20 % of pieces in a row are above these shares, and under 1 % of random ones.
 """
 FEW_ROWS: Final = 10
 """Fewest rows whose shares can refuse a table for good."""
 MIDDLE_SHARE_MAX: Final = 0.1
-"""Largest share of rows that are neither near nor far, in a table of several readings of each
-grasp, which has up to 5 %; streams have 35 to 45 %."""
+"""Largest share of rows neither near nor far, in a table with several readings of each grasp. Such
+tables have up to 5 %, streams 35 to 45 %."""
 BETWEEN_SHARE_MAX: Final = 0.6
-"""Largest share of them among those that are not near: streams have 63 to 95 %."""
+"""Largest share of these rows among all that are not near; streams have 63 to 95 %."""
 JUMP_SHARE_MIN: Final = 0.02
-"""Least share of rows that are far from the row before, in such a table: 50 readings."""
+"""Smallest share of rows far from the row before in such a table: one new grasp in 50 readings."""
 STEP_S: Final = (0.002, 0.5)
-"""Shortest and longest usual time between sweeps, s. In each unit other numbers are usual."""
+"""Shortest and longest usual time between sweeps, s, by which the unit of times is found."""
 SLOWEST_S: Final = 1.0
 """Time between rows, s, from which on they may be grasps."""
 BACK_SHARE_MAX: Final = 0.1
 """Largest share of rows of a stream that go back in time; it ends at the first of them."""
 EPOCHS: Final = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
-"""Times since 1970 lie above these numbers if they are in these units, s."""
+"""Smallest number of a time since 1970 in each unit, and that unit, s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +85,7 @@ class Layout:
     """Sweeps per second, in place of times."""
 
     has_outcomes: bool = False
-    """True if the lifts' outcomes are known; of a table, of some of its first rows."""
+    """True if outcomes of lifts are known; for a table, in some of its first rows."""
 
     @property
     def joints(self) -> Mapping[str, int]:
@@ -101,7 +101,7 @@ def layout_of(
 ) -> Layout:
     """Return the layout of a file; `fingers`: those to read, none for all that it has.
 
-    `read_as` and `rate_hz` decide what is in doubt. Raises `RecordingError`.
+    `read_as` and `rate_hz` decide doubtful cases. Raises `RecordingError`.
     """
     with open_recording(path) as file:
         return survey(path, file, fingers, read_as, rate_hz)
@@ -166,7 +166,7 @@ class _Rows:
         self._note_fingers(self.first)
 
     def refuse_values(self) -> None:
-        """Raise if the values of electrodes are something else than counts."""
+        """Raise `RecordingError` if the values of electrodes are not counts, such as volts."""
         values = [value for cells in self.first for value in self._electrodes(cells)]
         problem = problem_with(values, decimal_comma=self._comma)
         if problem is not None:
@@ -180,7 +180,7 @@ class _Rows:
             raise RecordingError(self.path, problem, column=self.columns.finger[1])
 
     def refuse_degrees(self) -> None:
-        """Raise if a joint has angles that no joint reaches, in radians, in a tenth of the rows."""
+        """Raise if a tenth of a joint's angles are, as radians, beyond the reach of any joint."""
         for name, place in self.columns.joints.items():
             angles = [number_of(row[place], decimal_comma=self._comma) for row in self.first]
             large = [angle for angle in angles if angle is not None and abs(angle) > ANGLE_MAX_RAD]
@@ -196,7 +196,7 @@ class _Rows:
 
     def has_outcomes(self, layout: Layout) -> bool:
         place = self.columns.slipped
-        if place is None or layout.is_stream:  # which may begin with an open hand
+        if place is None or layout.is_stream:  # a stream may begin with an open hand
             return place is not None
         return any(is_outcome(row[place]) for row in self.first)
 
@@ -255,7 +255,7 @@ def time_value(
 
 
 def _unit_s(rows: _Rows, column: TimeColumn, times: Sequence[float], step: float) -> float:
-    """Return the unit of times, s: as it is called, as large times have, or as steps are usual."""
+    """Return the unit of times, s, by the column's name, the size of times, or the usual step."""
     if rows.is_clock(column):
         return 1.0
     if column.unit_s is not None:
@@ -267,7 +267,7 @@ def _unit_s(rows: _Rows, column: TimeColumn, times: Sequence[float], step: float
 
 
 def _timed(rows: _Rows, column: TimeColumn, read_as: ReadAs | None) -> Layout:
-    """Return the layout of rows with times. Raises if these are of grasps, or none at all."""
+    """Return the layout of rows with times. Raises if they are grasps, or no time is valid."""
     times = rows.times(column)
     step = _median_step(times)
     layout = Layout(rows.columns, is_stream=True, unit_s=_unit_s(rows, column, times, step))
@@ -311,7 +311,7 @@ def are_labelled(cells: Iterable[tuple[str, str]]) -> bool:
 def problem_of_sweeps(
     blocks: Iterable[NDArray[np.floating]], read_as: ReadAs | None, *, labelled: bool
 ) -> str | None:
-    """Return why rows are not grasps: many nearly repeat another, as sweeps do. None: they are.
+    """Return why rows seem to be sweeps: many nearly repeat another row. None: they are grasps.
 
     `blocks`: counts, shape (rows, electrodes), NaN where one is missing. With
     `read_as="table"` rows may be several readings of each grasp. `labelled`: True for lifts that
@@ -349,14 +349,14 @@ def problem_of_sweeps(
 
 
 def _apart(one: NDArray[np.floating], other: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return by how much rows differ, counts; shape (rows,)."""
+    """Return the root mean square difference of pairs of rows, counts, shape (rows,)."""
     clipped = np.minimum(np.abs(one - other), CLIP_COUNTS)
     apart: NDArray[np.floating] = np.sqrt(np.square(clipped).mean(axis=1))
     return apart
 
 
 def _nearest(block: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return by how much each row differs from the row most like it, counts; shape (rows,)."""
+    """Return each row's difference from the row most like it, counts, shape (rows,)."""
     nearest = np.full(len(block), np.inf)
     for place in range(len(block) - 1):
         apart = _apart(block[place + 1 :], block[place])
@@ -366,7 +366,7 @@ def _nearest(block: NDArray[np.floating]) -> NDArray[np.floating]:
 
 
 def _without_gaps(counts: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return counts with the median of its electrode in place of a missing one."""
+    """Return counts in which an electrode's median replaces its missing values."""
     missing = np.isnan(counts)
     if not missing.any():
         return counts

@@ -19,8 +19,8 @@ Item = TypeVar("Item")
 class RecordedDriver(Opened, Generic[Item]):
     """Base of drivers that play items of known times at any speed. Times: ns, recording's clock.
 
-    The run begins when the first item is asked for. Items are read one ahead, so that the work of
-    reading does not add to their age. An error is raised after the items before it are taken.
+    The run begins when the first item is requested. Items are read one ahead, so that reading
+    does not add to their age. An error is raised once the items before it are taken.
     """
 
     name = "replay"
@@ -44,7 +44,7 @@ class RecordedDriver(Opened, Generic[Item]):
         self._next: tuple[int, Item] | None = None
         self._failure: RecordingError | None = None
         self._began: tuple[int, int] | None = None
-        """Start of the run, ns, by the clock and by the recording; None before."""
+        """Start of the run, ns, by `clock` and by the recording; None: not begun."""
 
     @property
     def serials(self) -> dict[str, str]:
@@ -58,7 +58,7 @@ class RecordedDriver(Opened, Generic[Item]):
         return None
 
     def start(self, items: Generator[tuple[int, Item], None, None]) -> None:
-        """Play `items`, of a driver that is closed."""
+        """Play `items`, pairs of time, ns, and content. Call it while closed."""
         self._began = None
         self.handed_over_ns = self._opened_ns = self._clock()
         self._playing = items
@@ -127,10 +127,8 @@ class ReadingsDriver(RecordedDriver[Item]):
         speed: float | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """`fingers`: those to play, in this order; each file must have them.
-
-        `speed`: factor of real time; None: as fast as possible.
-        """
+        """`fingers`: the rows of a reading; each file must have these fingers. `speed`: factor of
+        real time; None: as fast as possible."""
         super().__init__(paths, speed, clock)
         self._fingers = tuple(fingers)
         self.reset()
@@ -150,7 +148,7 @@ class ReadingsDriver(RecordedDriver[Item]):
 
 
 class LinkDecoder(Protocol):
-    """Decoder of one link, the same as in its driver."""
+    """Decoder of one link, as used by the live driver."""
 
     @property
     def counters(self) -> DriverCounters: ...

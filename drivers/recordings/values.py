@@ -74,7 +74,7 @@ def is_clock(cell: str) -> bool:
 
 
 def _clock_s(text: str) -> float | None:
-    """Return seconds since 1970, or of a time of day or a span. No zone means UTC."""
+    """Return the seconds of a date (since 1970), a time of day or a span. No zone: UTC."""
     if not text.isascii():
         return None
     if clock := _CLOCK.fullmatch(text):
@@ -97,15 +97,15 @@ def outcome_of(cell: str) -> bool | None:
 
 
 def is_outcome(cell: str) -> bool:
-    """Return True for an outcome that is known."""
+    """Return True if a cell has a known outcome."""
     return _OUTCOMES.get(cell.strip().lower()) is not None
 
 
 def problem_with(cells: Sequence[str], *, decimal_comma: bool) -> str | None:
-    """Return why values of electrodes are not counts, as a whole; None: most of them are.
+    """Return why most values of electrodes are not counts; None: most are.
 
-    A broken electrode has values that are missing or out of range; none has fractions, or
-    negative values other than the -1 of a missing one.
+    Values of a broken electrode are missing or out of range. No electrode has fractions, or
+    negative values other than -1, which stands for a missing one.
     """
     given = [cell for cell in cells if cell.strip().lower() not in BLANK]
     wrong = [cell for cell in given if count_of(cell, decimal_comma=decimal_comma) is None]
@@ -123,7 +123,7 @@ def _is_negative(cell: str) -> bool:
 
 
 def are_numbers(cells: Sequence[str]) -> bool:
-    """Return True if most cells are numbers, as those of a header never are."""
+    """Return True if most cells are numbers, which a header's never are."""
     return 2 * sum(number_of(cell) is not None for cell in cells) > len(cells)
 
 

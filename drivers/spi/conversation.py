@@ -30,12 +30,10 @@ NAME: Final = "spi"
 GREETING_NS = 500_000_000
 """Timeout of a PING at the start, ns."""
 GREETING_TRIES = 4
-"""PINGs at the start before the port is reopened; a board that resets needs a second or two.
-
-One more is sent if the serial numbers of the last answer are not confirmed yet.
-"""
+"""Number of PINGs at the start before the port is reopened. A board that resets needs 1 to 2 s. One
+more is sent if the serial numbers of the last answer are not confirmed yet."""
 PING_PERIOD_NS = 247_000_000
-"""Time between PINGs, ns. It is not a multiple of usual periods: a sweep may delay a PING."""
+"""Time between PINGs, ns. Not a multiple of usual periods: sweeps may delay a PING."""
 NONCES = 1 << 32
 PINGS_OUT_MAX = 8
 """Most PINGs that may wait for an answer; the oldest is given up."""
@@ -70,13 +68,12 @@ class Conversation:
         nonce: int = 0,
     ) -> None:
         """`port`: its name in messages. `fingers`: the rows of a reading. `sensors`: fingers in the
-        order of the chip selects; None: `fingers`. `nonce`: the first PING has the next one.
-        """
+        order of the chip selects; None: `fingers`. `nonce`: the first PING has `nonce` + 1."""
         self.link = Link(NAME)
         self.hello: Hello | None = None
         """Last HELLO of an accepted bridge; None before the first."""
         self.period_ns: int | None = None
-        """Time between two sweeps by `hello`, ns."""
+        """Time between two sweeps according to `hello`, ns; None before it."""
         self.serials: dict[str, str] = {}
         """Serial numbers in `hello` by finger; silent sensors are left out."""
         self.status: BridgeStatus | None = None
@@ -230,7 +227,8 @@ class Conversation:
         elif self._sweeps.hello.sampling != hello.sampling:
             self.lost(LinkCause.SETTINGS, "the bridge changed what it samples", arrival_ns)
         elif not self._is_confirmed(hello.serials):
-            # A serial number was misread, or a sensor exchanged: after STOP the bridge reads again.
+            # A serial number was misread, or a sensor exchanged. After STOP the bridge reads them
+            # again.
             self.lost(LinkCause.SERIALS, "the bridge names other sensors", arrival_ns)
         else:
             self._take(hello)
@@ -291,7 +289,7 @@ class Conversation:
         try:
             reading = self._sweeps.reading(sweep, arrival_ns)
         except ClockError as error:
-            # The next greeting begins with another clock.
+            # The next greeting starts another clock.
             self.counters.clock_faults += 1
             self.lost(LinkCause.CLOCK, f"the bridge's clock {error}", arrival_ns)
             return None
@@ -324,7 +322,7 @@ def _sensor_fault(serials: Sequence[str]) -> DeviceFault | None:
 
 
 def _about_errors(status: BridgeStatus, hello: Hello) -> Fact:
-    """Return the SPI errors of each chip select; `-` where no sensor answers."""
+    """Return a fact with the SPI errors of each chip select; `-` where no sensor answers."""
     errors = [
         count if serial else None
         for count, serial in zip(status.spi_errors, hello.serials, strict=False)

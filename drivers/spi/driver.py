@@ -95,7 +95,7 @@ class SpiBridgeDriver(Opened):
         return self.conversation.describe()
 
     def open(self) -> None:
-        """Start afresh and try the port once. Raises `DriverError` if no try can succeed."""
+        """Reset all state and try the port once. Raises `DriverError` if no try can succeed."""
         self.close()
         self.conversation = self._begin()
         self.conversation.link.start(self._clock())
@@ -209,7 +209,7 @@ class SerialLine:
         self._serial = port
         with contextlib.suppress(OSError, AttributeError):
             self.descriptor = port.fileno()
-        try:  # an FTDI adapter then sends every 1 ms, not every 16
+        try:  # makes an FTDI adapter send every 1 ms, not every 16
             port.set_low_latency_mode(True)
         except (OSError, ValueError, AttributeError) as error:
             _log.debug("%s: no low latency mode: %s", self.port, error)
@@ -229,7 +229,7 @@ class SerialLine:
             else:
                 port.reset_output_buffer()  # with bytes left, closing would wait up to 30 s
         except AttributeError:
-            pass  # a port without a buffer of its own
+            pass  # the port has no buffer of its own
         except FAILURES as error:
             _log.debug("%s: %s", self.port, error)
         # pyserial drops a socket that its peer has reset, but does not close it.
@@ -252,7 +252,7 @@ class SerialLine:
                 if len(chunk) < least:
                     break
         except FAILURES as error:
-            if not data:  # else the next call raises, after these bytes
+            if not data:  # after some bytes the next call raises
                 raise self._loss(error) from error
         if self.tap is not None and data:
             self.tap(LineEvent.RECEIVED, data)

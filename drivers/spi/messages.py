@@ -1,7 +1,7 @@
 """Frames and messages of `deploy/bridge/PROTOCOL.md`, version 1. Bytes only.
 
-A frame is `COBS(type: u8 | payload | crc: u32) 0x00`. For a message of a wrong length, or with
-contents that the protocol forbids, decoding returns None.
+A frame is `COBS(type: u8 | payload | crc: u32) 0x00`. Decoding returns None for a message
+with a wrong length or with contents that the protocol forbids.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ TICK_HZ_MIN = 1_000
 UNSEEDED: Final = (0x01, 0x81)
 """Types without `DIGEST`: HELLO and PING, which peers of any layout must be able to exchange."""
 _CRC_RESIDUE: Final = 0x2144DF1C
-"""CRC-32 of bytes followed by their own checksum: the same for all bytes and start values."""
+"""CRC-32 of any bytes followed by their own checksum; it does not depend on bytes or start."""
 _U32 = struct.Struct("<I")
 _LAYOUT = struct.Struct("<BI")
 _HELLO = struct.Struct(f"<BIIQIH{TEXT_BYTES}sIBB")

@@ -33,16 +33,14 @@ DRIFT_MAX = 500e-6
 Crystals keep 100 ppm, and the host's own clock may be adjusted by 500 ppm.
 """
 DOUBT_NS = 20_000_000
-"""Assumed error of a time, ns, while PINGs contradict each other: of 247 ms at a rate 8 % off.
-
-A computer whose time is being set may be off by that much for some seconds.
-"""
+"""Assumed error of a time while PINGs contradict each other, ns: 8 % of the 247 ms between two. A
+computer whose time is being set may be off by that much for some seconds."""
 AGE_MAX_NS = 10_000_000_000
 """Greatest age of a mapped time, ns; buffers on the way hold a few seconds at most."""
 PINGS = 8
-"""Number of the last PINGs that bound a time from below: about two seconds.
+"""Number of the last PINGs that bound a time from below: those of about two seconds.
 
-An older one would hide the age of readings on a slow line, once the rate is wrong by more than
+Older ones would hide the age of readings on a slow line once the rate is wrong by more than
 `DRIFT_MAX`.
 """
 
@@ -63,7 +61,10 @@ class BridgeCounters(FrameCounters):
     parity_words: int = 0
     error_words: int = 0
     unplugged_words: int = 0
-    """Words of a line that no sensor drives. These three leave out absent sensors."""
+    """Words read from a line that no sensor drives.
+
+    Like the two counters above, it leaves out absent sensors.
+    """
     absent_sensors: int = 0
     """Sensors without a serial number; each counts once in each sweep."""
     link_losses: int = 0
@@ -77,11 +78,15 @@ class BridgeCounters(FrameCounters):
     host_tx_dropped: int = 0
     """Frames to the bridge that were dropped because the port's buffer was full."""
     clock_faults: int = 0
-    """Times that the link was lost for the bridge's clock, and PINGs that doubt its rate."""
+    """Number of losses of the link due to the bridge's clock, and of PINGs that contradict its
+    rate."""
     bridge_overruns: int = 0
     bridge_tx_dropped: int = 0
     bridge_rx_errors: int = 0
-    """Damaged frames. These three are the bridge's own, since its reset, by the last STATUS."""
+    """Damaged frames that the bridge received.
+
+    Like the counters above it is from the last STATUS, since the bridge's reset.
+    """
 
 
 class SweepDecoder:
@@ -90,7 +95,8 @@ class SweepDecoder:
     def __init__(
         self, hello: Hello, sensors: Sequence[int], counters: BridgeCounters, clock: DeviceClock
     ) -> None:
-        """`hello`: describes the sampling. `sensors`: number of each row's sensor, from 0."""
+        """`hello`: describes the sampling. `sensors`: for each row of a reading, the number of its
+        sensor, from 0."""
         self.hello = hello
         self.clock = clock
         self.longest_ticks = 0
@@ -127,7 +133,7 @@ class SweepDecoder:
         return make_reading(words, marks, t_ns, self._counters, interrupted=interrupted)
 
     def _is_next(self, sweep: Sweep) -> bool:
-        """Return True if the sweep is newer than all before, and count the missing ones."""
+        """Return True if the sweep is newer than all before; count the sweeps missing before it."""
         if self._bridge_seq is None:
             if sweep.tick_start < self.hello.tick:
                 self._counters.stale_sweeps += 1  # the sweep was under way when STOP arrived
@@ -157,11 +163,11 @@ class SweepDecoder:
 
 
 class ClockError(ValueError):
-    """The clock of a bridge stands, falls back or jumps."""
+    """The clock of a bridge stands still, goes back or jumps."""
 
 
 class _Bound(NamedTuple):
-    """A PING that bounds the host time, ns, at which the clock showed `tick`."""
+    """Bounds by one PING on the host time, ns, at which the bridge's clock showed `tick`."""
 
     tick: int
     t_ns: int
@@ -171,17 +177,17 @@ class DeviceClock:
     """Map the ticks of one bridge, from one reset to the next, to monotonic host time.
 
     The clock showed the tick of an answered PING not before the PING was sent, and not after its
-    answer came. Both bounds move on with the ticks and widen by `DRIFT_MAX`. A reading has the
-    earliest time that its tick can have had by the last `PINGS`: it may look too old, never too
-    new while the rate is right to `DRIFT_MAX` (deploy/MEASURED.md). Its time is not before that
-    of the reading before, and at most `AGE_MAX_NS` before its arrival.
+    answer came. Both bounds advance with the ticks and widen by `DRIFT_MAX`. A reading gets the
+    earliest time that the last `PINGS` allow for its tick. It may look too old, but never too new
+    while the rate is right to `DRIFT_MAX` (deploy/MEASURED.md). Times never fall from one reading
+    to the next, and are at most `AGE_MAX_NS` before the arrival.
 
-    A PING that contradicts the bounds replaces them. Until the next one that agrees, times are
-    `DOUBT_NS` earlier, and the first may be before that of the reading before.
+    A PING that contradicts the bounds replaces them. Until a PING agrees with them, times are
+    `DOUBT_NS` earlier, and the first of these may be before the last reading's.
     """
 
     def __init__(self, tick_hz: int, tick: int, sent_ns: int, received_ns: int) -> None:
-        """Take the nominal rate, Hz, above 0, and the first PING, as in `round_trip`."""
+        """`tick_hz`: nominal rate, Hz, above 0. The first PING: as in `round_trip`."""
         self.round_trip_ns = received_ns - sent_ns
         """Shortest round trip of a PING, ns."""
         self._ns_per_tick = 1e9 / tick_hz
@@ -191,7 +197,8 @@ class DeviceClock:
         self._doubt_ns = 0
 
     def round_trip(self, tick: int, sent_ns: int, received_ns: int) -> None:
-        """Add an answered PING: host time before it was sent, and after its answer came."""
+        """Add an answered PING: its tick, and host times, ns, before sending it and after the
+        answer."""
         self.round_trip_ns = min(self.round_trip_ns, received_ns - sent_ns)
         earliest_ns = self._earliest_ns(self._earliest, tick)
         latest_ns = self._latest_ns(tick)
@@ -199,7 +206,7 @@ class DeviceClock:
         self._doubt_ns = DOUBT_NS if contradicts else 0
         if contradicts:
             self._sent.clear()
-            self._last_ns = 0  # by a bound that was wrong
+            self._last_ns = 0  # it came from a wrong bound
         self._sent.append(_Bound(tick, sent_ns))
         self._earliest = max(self._sent, key=lambda bound: self._earliest_ns(bound, tick))
         if contradicts or latest_ns - self._ns_per_tick >= received_ns:
@@ -207,7 +214,7 @@ class DeviceClock:
 
     @property
     def is_doubted(self) -> bool:
-        """True if the rate of the clock is wrong now, by more than `DRIFT_MAX`."""
+        """True if the last PING contradicted the bounds: the rate is off by over `DRIFT_MAX`."""
         return self._doubt_ns > 0
 
     def host_ns(self, tick: int, arrival_ns: int) -> int:
@@ -227,7 +234,7 @@ class DeviceClock:
 
     def _earliest_ns(self, bound: _Bound, tick: int) -> int:
         passed_ns = (tick - bound.tick) * self._ns_per_tick
-        slack_ns = abs(passed_ns) * DRIFT_MAX + self._ns_per_tick  # ticks are whole
+        slack_ns = abs(passed_ns) * DRIFT_MAX + self._ns_per_tick  # a tick is rounded
         return bound.t_ns + math.floor(passed_ns - slack_ns)
 
     def _latest_ns(self, tick: int) -> int:

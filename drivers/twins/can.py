@@ -18,7 +18,7 @@ from graspd.drivers.twins.faults import LinkFaultInjector, LinkFaults
 from graspd.drivers.twins.grasps.grasps import Counts
 
 SAMPLE_ID: Final = 0x100
-"""Default arbitration id of samples; that of the real board is not public."""
+"""Default arbitration id of samples; the real board's id is not public."""
 OTHER_COUNTS: Final = {PAC: 2050, PDC: 2800, TAC: 2010, TDC: 2260}
 """Counts of the channels that are not electrodes, as on an untouched hand."""
 SEND_TIMEOUT_S: Final = 0.1
@@ -49,10 +49,8 @@ class CanTwin(Opened):
         faults: LinkFaults = LinkFaults(),  # noqa: B008 (immutable)
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """`fingers`: of the rows of `counts`. `rate_hz`: sweeps per second of `serve`.
-
-        Raises `ValueError`, also for an interface that cannot be used here.
-        """
+        """`fingers`: finger of each row of `counts`. `rate_hz`: sweeps per second of `serve`.
+        Raises `ValueError`, also for an interface that cannot be used here."""
         if not 0.0 < rate_hz <= 1000.0:
             raise ValueError(f"rate_hz is {rate_hz}, must be above 0 and at most 1000")
         refuse_unusable(interface, channel, None, {})
@@ -143,7 +141,7 @@ class CanTwin(Opened):
         for frame in frames:
             identifier = int.from_bytes(frame[:ID_BYTES])
             message = can.Message(
-                timestamp=self._clock() / 1e9,  # kept only by a bus with preserve_timestamps
+                timestamp=self._clock() / 1e9,  # only a bus with preserve_timestamps keeps it
                 arbitration_id=identifier,
                 is_extended_id=identifier > STANDARD_ID_MAX,
                 data=frame[ID_BYTES:],

@@ -53,10 +53,10 @@ RATE_HZ = 100.0
 SWING_S = 4.0
 SWING_RAD = 0.2
 MIDDLE_RAD = 0.4
-"""Middle of the swing of a joint, rad; each joint is a little behind the one before."""
+"""Middle of each joint's swing, rad. Each joint lags a little behind the one before it."""
 
 BEHIND_MAX_NS = 100_000_000
-"""Longest delay, ns, that a sender catches up with; after more, its schedule starts again."""
+"""Longest delay that a sender makes up for, ns; after a longer one its schedule starts again."""
 
 
 class DatagramTwin(ABC):
@@ -71,7 +71,8 @@ class DatagramTwin(ABC):
         self.injected = self._injector.injected
         """Number of faults by name; `silenced`: datagrams made while the link was broken."""
         self._stalled_ns = 0
-        """Time for which it did not run, ns, as on a busy computer. The clock of a sender runs."""
+        """Time for which the twin did not run, ns, as on a busy computer; its sender's clock did
+        run."""
 
     @abstractmethod
     def datagrams(self) -> Iterator[bytes]:
@@ -93,7 +94,7 @@ class DatagramTwin(ABC):
         yield self._injector.flush()
 
     def serve(self, target: str, stop: threading.Event) -> None:
-        """Send to `udp://ADDRESS:PORT` until `stop` is set or the end. Raises `ValueError`."""
+        """Send to `udp://ADDRESS:PORT` until `stop` is set or the data end. Raises `ValueError`."""
         endpoint = Endpoint.parse(target)
         with socket.socket(endpoint.family, socket.SOCK_DGRAM) as sender:
             due_ns, cycles = time.monotonic_ns(), self.cycles()
@@ -114,8 +115,8 @@ class DatagramTwin(ABC):
 class PalmTwin(DatagramTwin):
     """Send counts, shape (fingers, 24) for each round of 14 packets, as a palm does.
 
-    `stuck_clock`: the palm always answers the same request. Fingers not in `fingers` have no
-    sensor, and their words show it; the words of fingers unplugged by a fault do not.
+    `stuck_clock`: the palm always answers the same request. The words of fingers not in
+    `fingers` are those of an absent sensor; the words of fingers unplugged by a fault are not.
     """
 
     period_ns = CYCLE_NS

@@ -21,7 +21,7 @@ class LinkFaults:
     drop_probability: float = 0.0
     duplicate_probability: float = 0.0
     reorder_probability: float = 0.0
-    """Chance that a frame comes after the next one instead of before it."""
+    """Chance that a frame is sent after the next frame."""
     one_byte_at_a_time: bool = False
     burst_frames: int = 1
     """Number of frames that are collected and then sent at once."""
@@ -46,7 +46,7 @@ class LinkFaults:
             raise ValueError("disconnect_every_frames must be at least 1")
 
     def refuse(self, link: str, *names: str) -> None:
-        """Raise `ValueError` if a fault of `names`, which the link cannot show, is set."""
+        """Raise `ValueError` if one of the faults `names` is set, which a twin of `link` lacks."""
         for name in names:
             if getattr(self, name) != getattr(LinkFaults(), name):
                 raise ValueError(f"{link} cannot show the fault {name.replace('_', '-')}")
@@ -68,7 +68,7 @@ class LinkFaultInjector:
     def spoil(self, frame: bytes, *, waits: bool = True) -> list[bytes]:
         """Return the frames to send now, with faults.
 
-        With `waits` False, the frame is not held back: it is sent after those that were.
+        `waits`: False if the frame must not be held back; it is sent after those that were.
         """
         faults = self.faults
         if self._happens(faults.drop_probability, "drop"):

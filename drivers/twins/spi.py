@@ -47,9 +47,9 @@ UNSENT_MAX_BYTES = 4096
 """Most bytes that wait for the host; after that, whole frames are dropped."""
 READ_BYTES = 4096
 IDLE_NS = 20_000_000
-"""Longest wait of `serve`, ns, before it asks `stop` again."""
+"""Longest wait of `serve` before it calls `stop` again, ns."""
 SWEEPS_AT_ONCE = 64
-"""Most sweeps in a row; after them the host's bytes are read."""
+"""Most sweeps in a row before the host's bytes are read."""
 UNDRIVEN_WORD = 0xFFFF
 OTHER_COUNT = 2000
 """Count of all channels that are not electrodes."""
@@ -58,7 +58,7 @@ _WORDS = np.array([encode_word(count) for count in range(4096)], dtype=np.uint16
 
 
 class SpiTwin(Opened):
-    """The bridge's side of the protocol. Call `serve`, or `run_once` again and again.
+    """The bridge's side of the protocol. Call `serve`, or `run_once` repeatedly.
 
     `path` becomes a symbolic link to a new pseudo-terminal at each `plug`, which is a reset.
     `source`: counts of each sweep, shape (sensors, 24); after the last the twin only answers.

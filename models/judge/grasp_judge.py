@@ -32,7 +32,7 @@ TINY = 1e-12  # for a probability of zero, which has no logarithm
 
 
 class Network(Protocol):
-    """Anything that gives probabilities for one input: a loaded model, or a trained system."""
+    """Interface of a network that judges one input: a loaded model, or a trained system."""
 
     inputs: InputBuilder
     """Makes the input of counts."""
@@ -63,8 +63,8 @@ class Examined(msgspec.Struct, frozen=True, eq=False, gc=False):
     grasp: NDArray[np.generic] | None = None
     """Counts that the session may learn from, shape (fingers, 24). None: it must not.
 
-    Only electrodes that are known to be broken are repaired in them. They may be unlike the
-    training: drift begins so.
+    Only electrodes known to be broken are repaired in them. They may be unlike the training,
+    because that is how drift begins.
     """
 
 
@@ -72,7 +72,7 @@ class Opinion(msgspec.Struct, frozen=True, gc=False):
     """Answer of the network for a grasp, or why there is none."""
 
     p_slip: float | None = None
-    """Probability of slip, nearer to the threshold while the session is young; None: no answer."""
+    """Probability of slip, moved towards the threshold in a young session; None: no answer."""
     refusal: Refusal | None = None
     """Why there is no answer; None if there is one, or no grasp."""
     repaired: tuple[str, ...] = ()
@@ -87,7 +87,7 @@ NO_OPINION = Opinion()
 class GraspJudge:
     """Judges held grasps with one network and, for a session model, today's session.
 
-    It has no clock, and nothing but `observe` changes what it says.
+    It has no clock, and only `observe` changes its later answers.
     """
 
     def __init__(
@@ -157,8 +157,8 @@ class GraspJudge:
             judged = _as_read(counts, found.values, found.implausible, session)
             repaired = self._names(found.implausible)
         if not seen:
-            # A young session learns from all, for that is how drift begins; later on a sensor that
-            # fails would slowly become its own standard.
+            # A young session learns from all grasps, as drift may have begun. Later on a sensor
+            # that fails would slowly become its own standard.
             learned |= session is None or not session.calibrated
             return Examined(judged, Refusal.NEVER_SEEN, (), grasp if learned else None)
         return Examined(judged, None, repaired, grasp)
@@ -181,13 +181,13 @@ class GraspJudge:
         margin = math.log(max(p_slip, TINY)) - math.log(max(p_stable, TINY))
         temperature = 1.0 if self.session is None else self.session.temperature
         if temperature != 1.0:
-            # Counted from the threshold, so that it stays on the same side.
+            # The temperature acts from the threshold on, so that the probability stays on its side.
             log_odds = self._log_threshold + (margin - self._log_threshold) / temperature
             p_slip = 1.0 / (1.0 + math.exp(-log_odds))
         return Opinion(p_slip, None, repaired, margin)
 
     def observe(self, examined: Examined, opinion: Opinion) -> None:
-        """Have the session take in a grasp with the opinion on it, if it may learn from it."""
+        """Let the session learn from a grasp with its opinion, if it may."""
         if self.session is None or examined.grasp is None:
             return
         p_slip = opinion.p_slip
@@ -218,7 +218,7 @@ def _as_read(
 
 
 def _is_flat(values: NDArray[np.float64], broken: NDArray[np.bool_] | None) -> bool:
-    """Return True if the sound electrodes of a finger read about the same; `values` are counts."""
+    """Return True if the sound electrodes of some finger read about the same counts, `values`."""
     numbers = [ELECTRODES] * len(values)
     if broken is not None:
         values = np.where(broken, 0.0, values)

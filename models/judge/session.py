@@ -26,7 +26,7 @@ class SessionCalibration:
     scale: NDArray[np.float64]
     """Spread of each electrode in the training over that of the session, shape (fingers, 24)."""
     calibrated: bool
-    """True if the session has the grasps that the model asks for, and is not `odd`."""
+    """True if the session has as many grasps as the model requires, and is not `odd`."""
     odd: bool
     """True if the session cannot have come from grasps of these fingers: see `is_odd`."""
     temperature: float
@@ -40,8 +40,8 @@ class SessionCalibration:
     ) -> None:
         """Start with the statistics of the training.
 
-        `takes`: the model's input, with those of its features. `counts_mean`, `counts_spread`:
-        mean and standard deviation of each electrode, counts, shape (fingers, 24).
+        `takes`: the model's input, with the statistics of its features. `counts_mean`,
+        `counts_spread`: mean and standard deviation of each electrode, counts, shape (fingers, 24).
         """
         self._takes = takes
         self._training = counts_mean, counts_spread
@@ -77,7 +77,7 @@ class SessionCalibration:
             self._settle()
 
     def reset(self) -> None:
-        """Start again: a sensor was exchanged."""
+        """Forget the session. Call when a sensor was exchanged."""
         self._statistics.reset()
         self._settle()
 

@@ -1,1 +1,1 @@
-"""Lessons of outcomes for a verdict, and the risk that is set; pure, without time and peers."""
+"""Learning from outcomes, and the risk rule; pure functions without clock and peers."""

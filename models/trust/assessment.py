@@ -1,4 +1,4 @@
-"""Assess a judged grasp by outcomes: its probability after learning, and what the risk permits."""
+"""Assess a judged grasp by outcomes: its corrected probability, and what the risk permits."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ class Assessment(msgspec.Struct, frozen=True):
     outcomes: int
     """Number of outcomes that `p_slip` rests on."""
     p_slip: float | None = None
-    """After learning, 0..1; the model's own until something was learned. None: not judged."""
+    """Probability of slip after learning, 0..1; at first the model's own. None: not judged."""
     log_odds: float = 0.0
     """Log-odds of slip, after learning."""
     permission: Permission = Permission.ALLOWED
     supervised: bool = False
-    """True to ask for its lift under supervision."""
+    """True to request a lift of the grasp under supervision."""
     features: bytes = b""
     """The learner's features, float64, for `Learner.learn`."""
 
@@ -38,9 +38,9 @@ def assess(
 ) -> Assessment:
     """Assess a grasp by the model's `p_slip`, its log-odds `margin`, and its flat `inputs`.
 
-    `name`: of the grasp; the same one is always supervised or never. `awaited`: announced lifts
-    whose outcome can still come. Raises `ValueError` for values that are not finite and for another
-    shape: such a grasp must be `unknown`.
+    `name`: id of the grasp, which decides by a hash if it is supervised. `awaited`: announced lifts
+    whose outcome can still come. Raises `ValueError` for values that are not finite or of another
+    shape; such a grasp must be `unknown`.
     """
     if not 0.0 <= p_slip <= 1.0:  # also true for NaN
         raise ValueError(f"{p_slip} is not a probability")

@@ -1,4 +1,4 @@
-"""Learns from how lifts ended what a model's probability of slip is worth with today's sensors.
+"""Learns from outcomes of lifts how to correct a model's probability of slip for today's sensors.
 
 Logistic regression, recursive and Bayesian: the weights have a Gaussian posterior, which each
 outcome updates once (one step of an extended Kalman filter, a Laplace approximation) and which
@@ -19,32 +19,32 @@ from graspd.models.trust.residual import GRASPS_MAX, Matrix, Residual, Vector
 TEMPERATURE: Final = 2.0
 """Divisor of the model's margin; networks are too sure of another day's grasps."""
 SCALE: Final = 2.8
-"""Factor of moderated log-odds, which are too timid on days, objects and poses that are new.
+"""Factor on moderated log-odds, which are too near to 0 for new days, objects and poses.
 
 With it, a tenth of the grasps with a `p_slip` of 0.1 slips. Fitted on the sessions of three
 quarters of the objects it is 2.75 to 2.79. The slope of outcomes on scaled log-odds is 1.00 on the
 others (`graspd report worth`, `worth` on the card of `small-session`).
 """
 MARGIN_MAX: Final = 30.0
-"""Larger margins, log-odds, say no more: the logarithm of the smallest probability that a network's
-float32 output counts as."""
+"""Largest magnitude of a margin, log-odds; larger ones are clipped. It corresponds to the smallest
+probability of a network's float32 output that is not counted as 0."""
 INPUT_MAX: Final = 1e3
-"""Larger inputs are refused: standardised features have a few units."""
+"""Largest magnitude of an accepted input. Standardised features have a few units."""
 MARGIN_SPREAD, BIAS_SPREAD, FEATURE_SPREAD = 0.5, 0.5, 0.2
 """Standard deviations of the prior: of the margin's weight, the bias, and each feature's weight."""
 DRIFT: Final = 2e-3
-"""Share of the prior's variances by which an outcome widens the posterior: what was learned fades
+"""Share of the prior's variances by which each outcome widens the posterior, so that learning fades
 within some hundred lifts."""
 MEAN_MAX: Final = 25.0
-"""Largest mean of a weight, and of the residual in log-odds, whatever is told: 50 times the
+"""Largest mean of a weight, and of the residual (log-odds), whatever outcomes come: 50 times the
 margin's standard deviation, 8 times the residual's."""
 ROUNDING: Final = 1.0 + 1e-9
 """Factor by which a kept mean or variance may be above its limit."""
 
 MOVE_MAX, WEIGHTS_MOVE_MAX = 1.25, 0.5
-"""Standard deviations by which one outcome moves the mean log-odds of its own grasp at most, all of
-them and by the weights. The weights judge grasps that are unlike, of which one outcome says little:
-without these limits one false outcome turns slips of unlike grasps `stable`."""
+"""Most standard deviations by which one outcome moves its own grasp's mean log-odds: in total, and
+by the weights alone. The weights also judge unlike grasps, on which one outcome says little.
+Without these limits one false outcome turns slips of unlike grasps `stable`."""
 
 
 class LearnerState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -54,14 +54,14 @@ class LearnerState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     mean: bytes
     covariance: bytes
     grasps: bytes = b""
-    """Inputs of the told grasps whose residual is in the state."""
+    """Inputs of the grasps with a known outcome whose residual is in the state."""
 
 
 class Learner:
     """Turns a model's margin and input into log-odds of slip, and learns from outcomes.
 
-    The state is of the weights, then of the residual at the latest told grasps. It is bounded for
-    ever: an outcome lowers the covariance, then mixes `DRIFT` of the prior's into it. Hence no
+    The state has the weights, then the residual at the latest grasps with an outcome. It stays
+    bounded: an outcome lowers the covariance, then mixes `DRIFT` of the prior's into it. Hence no
     variance exceeds its prior's, and no eigenvalue is below `DRIFT` times the prior's smallest,
     10^8 times what rounding can take. The covariance stays exactly symmetric, because every step
     changes symmetric pairs alike. No mean exceeds `MEAN_MAX`.
@@ -72,7 +72,7 @@ class Learner:
         self.inputs = inputs
         """Number of features of the model."""
         self.scale = SCALE if inputs else TEMPERATURE
-        """Factor on the moderated log-odds. Without a residual the model's own are the start."""
+        """Factor on the moderated log-odds. Without inputs the start is the model's own."""
         prior = np.full(inputs + 2, FEATURE_SPREAD)
         prior[:2] = MARGIN_SPREAD, BIAS_SPREAD
         self._prior: Vector = prior**2
@@ -80,7 +80,7 @@ class Learner:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all outcomes: a sensor was exchanged."""
+        """Forget all outcomes. Call when a sensor was exchanged."""
         self.outcomes = 0
         """Number of outcomes learned since the start or the last reset."""
         self._residual = Residual(np.empty((0, self.inputs)))
@@ -94,12 +94,12 @@ class Learner:
         return min(float((variances / self._prior).mean()), 1.0)
 
     def judge(self, margin: float, inputs: NDArray[np.floating]) -> tuple[float, Vector]:
-        """Return log-odds of slip, nearer to 0 the less is known of such grasps, and features.
+        """Return log-odds of slip and the features for `learn`.
 
-        `margin` is the model's log-odds of slip, before a young session softens them; `inputs`
-        (inputs,) what the model was given, as standardised features of a session. `learn` takes the
-        features once the outcome is known. Raises `ValueError` for another shape, and for what is
-        not finite or too large.
+        The less is known of such grasps, the nearer the log-odds are to 0. `margin`: the model's
+        log-odds of slip, before a young session softens them. `inputs`: its input, shape (inputs,),
+        such as standardised features. Raises `ValueError` for another shape, and for values that
+        are not finite or too large.
         """
         if inputs.shape != (self.inputs,):
             raise ValueError(f"inputs are of shape {inputs.shape}, not ({self.inputs},)")
@@ -119,7 +119,7 @@ class Learner:
         return np.concatenate((features, self._residual.shared(features[2:])))
 
     def learn(self, features: Vector, *, slipped: bool) -> None:
-        """Take in how the lift of a grasp with these features ended; takes 0.5 to 1 ms."""
+        """Learn the outcome of a grasp with these features of `judge`; takes 0.5 to 1 ms."""
         residual, weights = self._residual, slice(len(features))
         mean, known = self._mean, self._known(features)
         seen = self._spread @ known
@@ -149,7 +149,7 @@ class Learner:
         self.outcomes += 1
 
     def at_told(self) -> tuple[Vector, Matrix]:
-        """Return mean and covariance of the weights, then of the residual at the told grasps."""
+        """Return mean and covariance of the weights, then of the residual at learned grasps."""
         return self._residual.at_told(self._mean, self._spread)
 
     def state(self) -> LearnerState:
@@ -158,7 +158,7 @@ class Learner:
         return LearnerState(self.outcomes, *(each.astype("<f8").tobytes() for each in arrays))
 
     def restore(self, state: LearnerState) -> None:
-        """Continue from an earlier state. Raises `ValueError`, and changes nothing, for another."""
+        """Continue from a state. Raises `ValueError`, and changes nothing, if it does not fit."""
         count = min(state.outcomes, GRASPS_MAX) if self.inputs else 0
         size = self.inputs + 2 + count
         grasps = vector(state.grasps, count * self.inputs, INPUT_MAX).reshape(count, self.inputs)
@@ -180,7 +180,7 @@ class Learner:
 
 
 def of_format_2(state: LearnerState) -> LearnerState:
-    """Return a state that holds what `at_told` returns. Raises `ValueError` if it holds none."""
+    """Return a state in format 2, which holds the result of `at_told`. Raises `ValueError`."""
     mean, grasps = (np.frombuffer(each, "<f8") for each in (state.mean, state.grasps))
     size, count = len(mean), min(state.outcomes, GRASPS_MAX) if state.grasps else 0
     residual = Residual(grasps.reshape(count, -1) if count else np.empty((0, size - 2)))
@@ -191,14 +191,14 @@ def of_format_2(state: LearnerState) -> LearnerState:
 
 def sigmoid(log_odds: float) -> float:
     """Return the probability of these log-odds."""
-    small = math.exp(-abs(log_odds))  # of a negative number only: never overflows
+    small = math.exp(-abs(log_odds))  # the exponent is never positive, so nothing overflows
     return (1.0 if log_odds >= 0.0 else small) / (1.0 + small)
 
 
 def vector(data: bytes, width: int, limit: float = math.inf) -> Vector:
     """Return float64 values (width,).
 
-    Raises `ValueError` for another length, and for what is not finite or beyond +-`limit`.
+    Raises `ValueError` for another length, and for values not finite or beyond +-`limit`.
     """
     if len(data) != 8 * width:
         raise ValueError(f"is of {len(data) // 8} values, not of {width}")

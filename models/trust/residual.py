@@ -1,6 +1,7 @@
-"""Residual: log-odds of slip that linear weights cannot express, learned from grasps alike.
+"""Residual: log-odds of slip that linear weights cannot express, learned from similar grasps.
 
-It is a Gaussian process. Its values at the latest told grasps are part of the learner's state.
+It is a Gaussian process. A told grasp is one with a known outcome. The residual's values at the
+latest told grasps are part of the learner's state.
 Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, chapter 2.
 """
 
@@ -12,47 +13,47 @@ import numpy as np
 from numpy.typing import NDArray
 
 GRASPS_MAX: Final = 128
-"""Told grasps whose residual is in the state. Twice as many gain 0.5 points of F1, and an outcome
-takes four times as long."""
+"""Most told grasps with a residual in the state. Twice the number gains 0.5 points of F1, but an
+outcome takes four times as long."""
 SHARED_VARIANCE: Final = 9.0
 """Prior variance of the residual, log-odds squared, that grasps with equal inputs share."""
 OWN_VARIANCE: Final = 0.009
 """Prior variance of the residual that is a grasp's own. No eigenvalue of the prior is smaller."""
 REACH: Final = 0.5
-"""Root mean square difference of the inputs of two grasps whose residuals correlate by 0.61."""
+"""Length scale: root mean square difference of inputs at which residuals correlate by 0.61."""
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 
 
 class Residual:
-    """Prior of the residual at N told grasps, oldest first, and what follows for other grasps.
+    """Prior of the residual at N told grasps, oldest first, and predictions for other grasps.
 
-    A state is of W weights, then of the residual at the told grasps, as seen from other grasps: a
-    mean m (W + N,) and a spread S (W + N, W + N). With g, the features of the weights and then
-    `shared`, the mean log-odds of a grasp are g @ m. Their variance is g @ S @ g plus `variance`,
-    their covariance with those of another grasp g @ S @ g' plus the kernel. No inverse is needed:
-    an outcome adds to S a product of one vector.
+    A state has W weights, then the residual at the told grasps, in the basis that predicts other
+    grasps: a mean m (W + N,) and a spread S (W + N, W + N). With g, the features of the weights and
+    then `shared`, the mean log-odds of a grasp are g @ m. Their variance is g @ S @ g plus
+    `variance`, their covariance with those of another grasp g @ S @ g' plus the kernel. No inverse
+    is needed: an outcome adds to S a product of one vector.
     """
 
     def __init__(self, grasps: Matrix) -> None:
         """`grasps`: inputs of the told grasps, shape (N, inputs)."""
         inputs = grasps.shape[1]
         self.variance = SHARED_VARIANCE + OWN_VARIANCE if inputs else 0.0
-        """Prior variance of the residual at any grasp; 0 without inputs: there is none."""
+        """Prior variance of the residual at any grasp; 0 without inputs, where none exists."""
         self._scale = -0.5 / (max(inputs, 1) * REACH**2)
         self.grasps, self._squares = np.empty((0, inputs)), np.empty(0)
         self.prior = np.empty((0, 0))
-        """Covariance (N, N)."""
+        """Prior covariance of the residual at the told grasps, shape (N, N)."""
         for each in grasps:
             self.add(each)
 
     def add(self, inputs: Vector) -> None:
-        """Tell one more grasp, the last one; the residual at it is as it is seen from the others.
+        """Append a told grasp. Its residual is first predicted by the others alone.
 
-        In a state its mean and its spread are zeros.
+        In a state its mean and spread are therefore zeros.
         """
-        # Not a product of matrices: that rounds otherwise among other rows.
+        # Not a matrix product, whose rounding depends on the other rows.
         squares = np.square(self.grasps - inputs).sum(axis=1, keepdims=True)
         shared = self._shared(squares)
         self.prior = np.block([[self.prior, shared], [shared.T, self.variance]])
@@ -60,7 +61,7 @@ class Residual:
         self._squares = np.append(self._squares, inputs @ inputs)
 
     def drop(self, mean: Vector, spread: Matrix) -> tuple[Vector, Matrix]:
-        """Forget the oldest grasp; return the state without it. Others keep its lesson."""
+        """Forget the oldest grasp; return the state without it. The others keep what it taught."""
         links = solve(self.prior[1:, 1:], self.prior[1:, 0])
         self.grasps, self._squares = self.grasps[1:], self._squares[1:]
         self.prior = self.prior[1:, 1:]
@@ -82,7 +83,7 @@ class Residual:
         return mean
 
     def at_told(self, mean: Vector, spread: Matrix) -> tuple[Vector, Matrix]:
-        """Return mean and covariance of a state's weights and of its residual at the told."""
+        """Return mean and covariance of a state's weights and of its residual at told grasps."""
         links = self._links(len(mean))
         covariance = links @ spread @ links
         weights = len(mean) - len(self.grasps)
@@ -98,17 +99,17 @@ class Residual:
         return back @ mean, (spread + spread.T) / 2.0
 
     def _links(self, size: int) -> Matrix:
-        """Return the factors of a state's columns in the residual at the told grasps."""
+        """Return the matrix that maps a state of this size to the residual at the told grasps."""
         links, weights = np.eye(size), size - len(self.grasps)
         links[weights:, weights:] = self.prior
         return links
 
     def shared(self, inputs: Vector) -> Vector:
-        """Return the covariances (N,) of the residual at another grasp with those at the told."""
+        """Return the covariances (N,) of the residual at another grasp with that at told grasps."""
         return self._shared(self._squares + inputs @ inputs - 2.0 * (self.grasps @ inputs))
 
     def _shared(self, squares: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return covariances of grasps at these squared distances."""
+        """Return covariances of the residuals of grasps at these squared distances."""
         # Rounding leaves distances of equal grasps a little below 0.
         covariances: NDArray[np.float64] = np.exp(self._scale * np.maximum(squares, 0.0))
         return SHARED_VARIANCE * covariances
@@ -117,7 +118,7 @@ class Residual:
 def solve(matrix: Matrix, values: Vector) -> Vector:
     """Return x (N,) of `matrix` @ x = `values`, positive definite, N up to 128.
 
-    It is solved in halves, of which BLAS makes no threads: those may wait 100 ms for a processor.
+    It is solved in halves, for which BLAS starts no threads: these may wait 100 ms for a processor.
     """
     half = len(matrix) // 2
     links, rest = matrix[:half, half:], matrix[half:, half:]

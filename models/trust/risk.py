@@ -1,4 +1,4 @@
-"""How many lifts of `stable` verdicts may slip: a budget of slips that every outcome changes."""
+"""The risk rule: a budget of slips among `stable` lifts, which every outcome changes."""
 
 from __future__ import annotations
 
@@ -11,21 +11,20 @@ from typing import Annotated, Final, NamedTuple
 import msgspec
 
 BUDGET_START: Final = 5.0
-"""Slips beyond the allowed share that a session may have. With 3 a session is blocked early, with
-4 fewer good lifts are kept."""
+"""Number of slips beyond the allowed share that a session may have. With 3 a session is blocked
+early; with 4 fewer good lifts are kept."""
 BUDGET_MAX: Final = 8.0
-"""Most slips that are saved up. It bounds the slips of every stretch of lifts."""
+"""Largest budget, slips. It bounds the slips in every stretch of lifts."""
 SHARE_YOUNG: Final = 1.5
-"""Probability of slip that may be called `stable` before an outcome, in units of the share that is
-set: with a full budget the surest grasps slip much less often than the threshold says."""
+"""Largest probability of slip called `stable` before any outcome, in units of the allowed share.
+With a full budget the surest grasps slip much less often than the threshold says."""
 SHARE_PROVEN: Final = 3.0
-"""The same once `PROVEN_FROM` outcomes are known: seven sessions in ten then keep to the target.
-From 3 to 5 both the good lifts that are kept (by 3 to 6 %) and the sessions above the target (29 to
-54 %) rise."""
+"""The same once `PROVEN_FROM` outcomes are known. With 3, seven sessions in ten keep to the target.
+With 5, 3 to 6 % more good lifts are kept, but 54 % of sessions exceed the target, not 29 %."""
 PROVEN_FROM: Final = 40
-"""Outcomes after which the learner knows the day."""
+"""Number of outcomes after which the learner knows the day."""
 ROUNDING: Final = 1e-9
-"""Slips. A budget is a sum of shares."""
+"""Tolerance of a budget, slips, because it is a rounded sum of shares."""
 
 Count = Annotated[int, msgspec.Meta(ge=0)]
 
@@ -35,11 +34,11 @@ class Permission(StrEnum):
 
     ALLOWED = "allowed"
     WITHHELD = "withheld"
-    """Too likely to slip for the risk that is set."""
+    """The grasp is too likely to slip for the configured risk."""
     UNPROVEN = "unproven"
-    """Too few outcomes are known, or too many announced lifts have none: lift under supervision."""
+    """Too few outcomes are known, or too many announced lifts lack one. Lift under supervision."""
     RISK_EXCEEDED = "risk-exceeded"
-    """More slipped than the rule can make good: nothing is `stable` until the user resets it."""
+    """More lifts slipped than the rule can make up for. Nothing is `stable` until a reset."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +54,7 @@ class RiskLimits:
     """Share, 0..1, of the withheld grasps to be lifted under supervision: only their outcomes show
     that the rule is too strict."""
     outstanding_max: int = 5
-    """Announced lifts, from 1 on, whose outcome may be out at once."""
+    """Most announced lifts without an outcome at one time, 1 or more."""
 
 
 class RiskState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -69,7 +68,7 @@ class RiskState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class RiskOutcomes(NamedTuple):
-    """Outcomes of `stable` lifts at one moment; `RiskReport` of the messages says what each is."""
+    """Outcomes of `stable` lifts at one moment; `RiskReport` of the messages explains them."""
 
     target: float | None
     lifts: int
@@ -89,26 +88,25 @@ class RiskOutcomes(NamedTuple):
 
 
 class Risk:
-    """The online rule: `stable` only while a slip is affordable, and only of what is likely held.
+    """The online rule: `stable` only while a slip is affordable, and only for likely stable grasps.
 
     With a = `max_slip_when_stable`, N `stable` lifts and S slips among them, M = `outstanding_max`:
 
         S <= a N + BUDGET_START            S <= a N + BUDGET_MAX of any stretch of lifts
         S <= a N + BUDGET_START + M (1 - a)     of all lifts that were told or announced
 
-    1. A told `stable` lift adds a - y to the budget b, y = 1 for a slip; all else only lowers b.
-    2. Hence b <= BUDGET_START + a N - S, which is S <= a N + BUDGET_START - b.
-    3. A stretch begins at b <= BUDGET_MAX. In the same way S <= a N + BUDGET_MAX - b for it.
-    4. `stable` is said only while b >= 1 - a. If each outcome is told before the next `stable`,
-       a slip leaves b >= 0. This gives the first two bounds.
-    5. Let m announced lifts be out. w = b - m (1 - a) is what is left of b if all of them slip.
-    6. An announced grasp was called `stable` at b >= 1 - a and m < M. Hence w >= -(M - 1) (1 - a)
-       after its announcement.
-    7. An outcome of an announced lift lowers neither w nor this minimum: a slip takes 1 - a from b
-       and m by one. Caps leave b >= BUDGET_START, and m <= M.
-    8. A lift that leaves the book untold counts as a slip. Hence 6 holds at every moment.
-    9. With the m lifts counted as slips, 2 is S <= a N + BUDGET_START - w: the third bound.
-    10. Lifts that are told late without an announcement can leave b < 0; `bound` adds that.
+    1. A told `stable` lift adds a - y to the budget b, y = 1 for a slip; all else only lowers b. 2.
+    Hence b <= BUDGET_START + a N - S, which is S <= a N + BUDGET_START - b. 3. A stretch begins at
+    b <= BUDGET_MAX. In the same way S <= a N + BUDGET_MAX - b for it. 4. `stable` is said only
+    while b >= 1 - a. If each outcome is told before the next `stable`, a slip leaves b >= 0. This
+    gives the first two bounds. 5. Let m announced lifts be out. w = b - m (1 - a) is what is left
+    of b if all of them slip. 6. An announced grasp was called `stable` at b >= 1 - a and m < M.
+    Hence w >= -(M - 1) (1 - a) after its announcement. 7. An outcome of an announced lift lowers
+    neither w nor this minimum: a slip takes 1 - a from b and m by one. Caps leave b >=
+    BUDGET_START, and m <= M. 8. An announced lift that leaves the book without an outcome counts as
+    a slip. Hence 6 holds at every moment. 9. With the m lifts counted as slips, 2 is S <= a N +
+    BUDGET_START - w: the third bound. 10. Late outcomes of lifts without an announcement can leave
+    b < 0; `bound` adds that.
 
     The threshold, the learner, the model and the data play no part: any threshold has these bounds.
     They count what was told, true or not. It is a rule of online selective inference: Gibbs and
@@ -118,7 +116,7 @@ class Risk:
     def __init__(self, limits: RiskLimits) -> None:
         self.limits = limits
         self.budget = BUDGET_START
-        """Slips that are affordable now, b."""
+        """Number of slips that are affordable now, b."""
         self.lifts = 0
         """`stable` lifts whose outcome is known."""
         self.slips = 0
@@ -154,7 +152,7 @@ class Risk:
         return min(math.log(odds), 0.0)
 
     def figures(self, outstanding: int, announced: int, awaited: int) -> RiskOutcomes:
-        """Return the outcomes until now, with the lifts that have none by the book."""
+        """Return the outcomes until now, with the lift book's numbers of lifts that have none."""
         return RiskOutcomes(
             target=self.limits.max_slip_when_stable,
             lifts=self.lifts,
@@ -181,16 +179,16 @@ class Risk:
         return Permission.UNPROVEN if awaited >= self.limits.outstanding_max else Permission.ALLOWED
 
     def supervised(self, permission: Permission, seed: str, grasp: int) -> bool:
-        """Return True to ask for a lift under supervision; the same for the same seed and grasp."""
+        """Return True to request a lift under supervision; `seed` and `grasp` decide draws."""
         if permission is not Permission.WITHHELD:
             return permission is Permission.UNPROVEN
         digest = hashlib.blake2b(f"{seed} {grasp}".encode(), digest_size=8).digest()
         return int.from_bytes(digest) / 2.0**64 < self.limits.explore
 
     def take(self, *, stable: bool, slipped: bool, proves: bool) -> None:
-        """Take in an outcome, and whether the grasp had been called `stable`.
+        """Take in an outcome. `stable`: the grasp had been called so.
 
-        `proves` is false for lifts with former sensors: they count, but not for the warm-up.
+        `proves`: False for lifts with former sensors, which do not count for the warm-up.
         """
         self.proven += proves
         if not stable:
@@ -202,17 +200,17 @@ class Risk:
             self.budget = min(self.budget + alpha - slipped, BUDGET_MAX)
 
     def take_untold(self) -> None:
-        """Count an announced lift whose outcome cannot come any more as a slip."""
+        """Count an announced lift as a slip, because its outcome can no longer come."""
         if self.limits.max_slip_when_stable is not None:
             self.take(stable=True, slipped=True, proves=False)
 
     def exchanged(self, proven: int = 0, budget: float | None = None) -> None:
-        """Keep what slipped, not what was saved up: a sensor was exchanged.
+        """Keep the slips but not the saved-up budget. Call when a sensor was exchanged.
 
-        `proven`, `budget`: of the sensors that are there now, as they were known last.
+        `proven`, `budget`: last known values with the new sensors; see `Exchanged`.
         """
         self.budget = min(self.budget, BUDGET_START)
-        if budget is not None:  # not below what the slips that are counted lead to
+        if budget is not None:  # not below the budget that follows from the counted slips
             self.budget = min(self.budget, max(budget, -float(self.slips)))
         self.proven = proven
 

@@ -14,7 +14,7 @@ from graspd.models.contract import ModelError
 
 ZOO = Path(__file__).resolve().parent
 CARD_MAX_BYTES = 16 << 20
-"""A card has 0.1 MB."""
+"""Largest card, bytes; a usual one has 0.1 MB."""
 NAME_MAX = 64
 
 
@@ -24,8 +24,9 @@ def names() -> list[str]:
 
 
 def for_hand(name: str, fingers: Collection[Finger]) -> str:
-    """Return the name of a model's form for these fingers, such as `small-session-ff-th`.
-    Return the name itself if there is no such form, or if it is one already."""
+    """Return the name of a model's variant for these fingers, such as `small-session-ff-th`.
+
+    Return the name itself if no such variant exists, or if it is one already."""
     hand = [finger for finger in get_args(Finger) if finger in fingers]
     form = "-".join((name, *hand))
     is_form = name.endswith(tuple(f"-{finger}" for finger in get_args(Finger)))
@@ -33,17 +34,17 @@ def for_hand(name: str, fingers: Collection[Finger]) -> str:
 
 
 def judging(fingers: Collection[Finger]) -> list[str]:
-    """Names of the models of exactly these fingers. Raises `ModelError`: a wrong card."""
+    """Return the names of models for exactly these fingers. Raises `ModelError` for a bad card."""
     return [name for name in names() if set(card(name)["contract"]["fingers"]) == set(fingers)]
 
 
 def card(name: str) -> dict[str, Any]:
-    """The card of a model by its name. Raises `ModelError` if there is none."""
+    """Return the card of a model by name. Raises `ModelError` if there is none."""
     return read_card(find(name).with_suffix(".json"))
 
 
 def read_card(path: Path) -> dict[str, Any]:
-    """A card (JSON), checked to have a contract and a file. Raises `ModelError`."""
+    """Return a card (JSON), checked to have a contract and a file. Raises `ModelError`."""
     try:
         if path.stat().st_size > CARD_MAX_BYTES:
             raise ModelError(f"{path}: larger than {CARD_MAX_BYTES} bytes, not a card")
@@ -78,7 +79,7 @@ def ships(path: Path, sha256: str) -> bool:
 
 
 def find(name: str) -> Path:
-    """Path of a model by its name. Raises `ModelError` listing the names that exist."""
+    """Return the path of a model by name. Raises `ModelError`, which lists the existing names."""
     if name not in names():
         import difflib  # only where it is needed
 

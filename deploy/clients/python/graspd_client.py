@@ -1,4 +1,4 @@
-"""May the hand lift? The newest verdict of a graspd daemon, and `unknown` where there is none.
+"""May the hand lift? Client of a graspd daemon: its newest verdict, or `unknown` without one.
 
 One file to copy: it needs Linux, Python 3.9 or newer and pyzmq, and nothing of graspd itself. The
 messages are those of deploy/wire/README.md, version 1.
@@ -7,9 +7,9 @@ messages are those of deploy/wire/README.md, version 1.
         if answer := client.may_i_lift(0.5):
             client.tell(answer.verdict, Outcome.HELD if lift() else Outcome.SLIPPED)
 
-Nothing here runs by itself but ZeroMQ's own thread, and an object belongs to the thread that made
+Only ZeroMQ's own thread runs in the background. Use an object only in the thread that made
 it. Only `verdict(wait_s)`, `may_i_lift(deadline_s)`, `wait_for_grasp(deadline_s)`,
-`wait_for_slide(timeout_s)` and `tell(..., wait_s)` wait, and no longer than they are told.
+`wait_for_slide(timeout_s)` and `tell(..., wait_s)` wait, at most for the given time.
 `AsyncClient` has the same for asyncio.
 """
 
@@ -49,47 +49,47 @@ __all__ = [
     "Verdict",
 ]
 
-VERSION = 1  # of the messages; what has another is not understood
-INTEGER_MAX = 2**60  # of a message: as a time, 36 years in ns
-REAL_MAX = 1e12  # of a message or an age: as a time, thirty years in ms
-WAIT_MAX_S = 1e9  # of a call: thirty years
+VERSION = 1  # version of the messages; others are not understood
+INTEGER_MAX = 2**60  # largest integer in a message: 36 years in ns
+REAL_MAX = 1e12  # largest number or age in a message: thirty years in ms
+WAIT_MAX_S = 1e9  # longest wait of a call: thirty years
 # A verdict has 0.7 kB, at most 3; a peer that sends more is not a daemon and is disconnected.
 MESSAGE_MAX_BYTES = 1 << 16
-OPENINGS_MAX = 100  # of lists and objects in a message, and so its depth; a verdict has ten
+OPENINGS_MAX = 100  # most lists and objects in a message; a verdict has ten
 QUEUE_MAX = 1000  # messages that wait to be read: ten seconds at 100 Hz
-# A client that reads nothing for longer reconnects: its queue is old, and new messages are lost.
+# A client that reads nothing for longer reconnects, because its queue is old and full.
 READ_WITHIN_NS = 5_000_000_000
-# Shortest and longest time without a message after which a client reconnects. libzmq does not try
-# again by itself after it was turned away, but by now the client may be let in.
+# Shortest and longest time without a message after which a client reconnects. libzmq does not
+# # retry after a refusal, but the daemon may admit the client by then.
 QUIET_NS, QUIET_MAX_NS = 1_000_000_000, 10_000_000_000
-# The computer has slept if its clocks have moved apart by more. A sleep takes seconds, the
+# The computer has slept if its two clocks differ by more. A sleep takes seconds, the
 # scheduler a moment between two looks at the clocks.
 SLEPT_NS = 50_000_000
 # Longest wait in one piece while the clock of another computer is not known: so well is it known
 # when a message came.
 SLICE_MS = 10
-# What a message may come from the future by before the clocks count as different ones.
+# Most by which a message's time may be in the future while the clocks count as the same.
 CLOCK_SLACK_NS = 1_000_000
-# By which two computers' clocks may run apart: NTP slews by 5e-4, a bad crystal is off by 1e-4.
+# Largest drift between two computers' clocks: NTP slews by 5e-4, a bad crystal is off by 1e-4.
 DRIFT = 1e-3
-# By which they may have run apart in all: a delay that grows as slowly looks the same.
+# Largest total drift. A delay that grows as slowly looks the same.
 DRIFT_MAX_NS = 20_000_000
-# Between two questions for the daemon's clock, and after one that was not answered.
+# Time between two questions for the daemon's clock, also after an unanswered one.
 CLOCK_EVERY_NS, CLOCK_RETRY_NS = 1_000_000_000, 10_000_000_000
-FORMER_MAX = 16  # starts of the daemon that are remembered as over
-# On TCP: time between two signs of life, and time without one until reconnecting.
+FORMER_MAX = 16  # most ended starts of the daemon that are remembered
+# On TCP: time between two heartbeats, and time without one until reconnecting.
 HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 1000, 3000
-NAME_BYTES = 16  # of a client's name, which routing ids begin with: random, the first not zero
-OBJECT_MAX = 64  # characters of an object's name
-LIFTS_MAX = 256  # that are remembered: as many as graspd takes outcomes of
-WARN_EVERY = 10  # lifts whose outcome was never told
+NAME_BYTES = 16  # length of a client's random name, with which its routing ids begin
+OBJECT_MAX = 64  # most characters of an object's name
+LIFTS_MAX = 256  # lifts that are remembered, as in graspd
+WARN_EVERY = 10  # unreported lifts for each warning
 # Longest wait at closing until graspd has received that no lift follows, and most connections that
 # say so at a time.
 TAKE_BACK_MS, LEAVING_MAX = 200, 4
 
-# The only reasons of a grasp that may be lifted under supervision: [risk] alone is against it.
+# The only reasons with which a grasp may be lifted under supervision: they come from [risk].
 _WITHHELD = {"unproven", "low-confidence"}
-# Name of an object, as the daemon takes it.
+# Pattern of an object's name that the daemon accepts.
 _OBJECT = re.compile(rf"[A-Za-z0-9_][A-Za-z0-9_.-]{{0,{OBJECT_MAX - 1}}}")
 _OBJECT_IS = f"1 to {OBJECT_MAX} ASCII letters, digits, _, -, ., the first no - and no ."
 
@@ -123,7 +123,7 @@ class FingerState(str, Enum):  # noqa: UP042 - StrEnum needs Python 3.11
 
 
 class Outcome(Enum):
-    """How a lift ended; `Outcome("held")` is understood as `Outcome("stable")`, a bool is not."""
+    """How a lift ended; `Outcome("held")` is the same as `Outcome("stable")`. A bool is refused."""
 
     HELD = "stable"
     SLIPPED = "slip"
@@ -136,16 +136,17 @@ class Outcome(Enum):
 
 @dataclass(frozen=True)
 class Risk:
-    """Outcomes of `stable` lifts: number of told `lifts`, and of `slips` among them."""
+    """Outcomes of `stable` lifts: number of `lifts` with a known outcome, and of `slips` among
+    them."""
 
     target: float | None  # share of slips that is allowed; None: no risk is set
     lifts: int
     slips: int
     outstanding: int  # outcomes that can still come
-    bound: float | None  # of `slips`; each outstanding lift adds one
-    warm_up_left: int  # outcomes until most grasps need no supervision
+    bound: float | None  # upper bound of `slips`; each outstanding lift adds one
+    warm_up_left: int  # outcomes missing until most grasps need no supervision
     announced: int = 0  # `lift` questions that were answered `stable`
-    awaited: int = 0  # those without an outcome; too many, and nothing is `stable`
+    awaited: int = 0  # announced lifts without an outcome; too many forbid `stable`
 
 
 @dataclass(frozen=True)
@@ -153,17 +154,17 @@ class Verdict:
     """Verdict on the grasp. True in an `if` exactly when it is stable and needs no person.
 
     `decision` is `stable`, `slip` or `unknown`. `reasons` say why it is unknown: the daemon's, or
-    one of those in deploy/clients/README.md. `p_slip` is the probability of slip, None when
-    unknown, and rests on `outcomes` told outcomes; the network alone says `p_slip_model`. `grasp`
-    is the number of the contact episode, `age_ms` at least the time since the reading's last byte.
-    `supervised`: its lift would teach, but only while a person watches. `early`: it was judged when
-    nothing moved fast, but something might still slide slowly. `still_ms` is for how long the hand
-    has been still, ms: from 100 on nothing moves fast, from 240 on nothing slides slowly either.
-    `motion` is how each finger moves, in units of its own noise, and None where that is not known;
-    `motion_limits` what that is at most while it is still. `fingers` is what each one feels, None
-    where that is not known, and always where the reading is older than `max_age_ms`. `owner`
-    is `you` if you report the outcome of the lift, `another` if another controller does: it may be
-    lifting. None: not known before the first message, or not told by the daemon.
+    one of those in deploy/clients/README.md. `p_slip` is the probability of slip after learning
+    from `outcomes` lifts, `p_slip_model` that of the network alone; both are None when unknown.
+    `grasp` is the number of the contact episode, `age_ms` at least the time since the reading's
+    last byte. `supervised`: graspd would learn from the lift; lift only while a person watches.
+    `early`: it was judged when nothing moved fast, but something might still slide slowly.
+    `still_ms` is for how long the hand has been still, ms: from 100 on nothing moves fast, from 240
+    on nothing slides slowly either. `motion` is the motion of each finger, in units of its own
+    noise; `motion_limits` is the largest motion that counts as still. `fingers` has the state of
+    each finger. Each is None if not known; a state is never known from a reading older than
+    `max_age_ms`. `owner` is `you` if you report the outcome of the lift, `another` if another
+    controller does, which may be lifting. Fields that no message has given yet are None.
     """
 
     decision: Decision
@@ -188,7 +189,7 @@ class Verdict:
         return self.decision == Decision.STABLE and not self.supervised
 
     def unknown(self, *reasons: str) -> Verdict:
-        """The same, but unknown, and not to be lifted."""
+        """Return the same verdict as `unknown` for these reasons, which forbids a lift."""
         held_back = replace(self, decision=Decision.UNKNOWN, reasons=reasons, supervised=False)
         return replace(held_back, p_slip=None, p_slip_model=None)
 
@@ -198,10 +199,10 @@ class LiftAnswer:
     """Whether to lift. True in an `if` exactly when the hand may."""
 
     verdict: Verdict
-    """Verdict that decided; it has `no-answer` and `late` besides the usual reasons."""
+    """Verdict that decided. Its reasons may also be `no-answer` and `late`."""
     waited_s: float
     supervised: bool = False
-    """It may, but only while a person watches; never true unless such lifts were asked for."""
+    """True if the hand may lift only while a person watches; requested by `supervised=True`."""
 
     def __bool__(self) -> bool:
         return bool(self.verdict) or self.supervised
@@ -212,12 +213,12 @@ class SlideAnswer:
     """Answer about a lift by its fingers. True in an `if` exactly when it must be stopped."""
 
     verdict: Verdict
-    """The newest; its `fingers` and `reasons` say what is known."""
+    """Newest verdict; its `fingers` and `reasons` say what is known."""
     waited_s: float
     sliding: tuple[str, ...] = ()
     """Fingers along which something slides."""
     held: bool = False
-    """All fingers that touched still did when the time was over, and nothing slid."""
+    """True if until the timeout nothing slid and each finger that touched still touches."""
 
     def __bool__(self) -> bool:
         return not self.held
@@ -225,10 +226,10 @@ class SlideAnswer:
 
 @dataclass(frozen=True)
 class OutcomeAnswer:
-    """Whether graspd has taken how a lift ended. True in an `if` exactly when it has."""
+    """Answer to an outcome. True in an `if` exactly when graspd has taken it."""
 
     why: str = ""
-    """Why not: the daemon's words, or one of those in deploy/clients/README.md."""
+    """Why it was not taken: the daemon's text, or a reason of deploy/clients/README.md."""
 
     def __bool__(self) -> bool:
         return not self.why
@@ -238,16 +239,16 @@ class OutcomeAnswer:
 class Counts:
     """Numbers of messages since the start."""
 
-    messages: int = 0  # new ones of this hand
-    lost: int = 0  # gaps in `seq`, in messages
+    messages: int = 0  # new messages of this hand
+    lost: int = 0  # messages missing by gaps in `seq`
     repeats: int = 0  # messages that were known already
-    malformed: int = 0  # messages that are not understood, answers too
+    malformed: int = 0  # messages and answers that are not understood
     restarts: int = 0  # restarts of the daemon
-    former: int = 0  # messages of a start that is over
+    former: int = 0  # messages of an earlier start of the daemon
 
 
 class Keys(NamedTuple):
-    """CURVE keys, Z85: the daemon's public one, and one's own two."""
+    """CURVE keys, Z85: the daemon's public key, and the client's own pair."""
 
     server_key: bytes
     public_key: bytes
@@ -255,7 +256,8 @@ class Keys(NamedTuple):
 
     @classmethod
     def load(cls, server: Path, own: Path) -> Keys:
-        """From the daemon's `.key` and one's own `.key_secret` file (`graspd keys`).
+        """Return the keys in the daemon's `.key` and the client's `.key_secret` file (`graspd
+        keys`).
 
         Raises `OSError` or `ValueError`.
         """
@@ -279,14 +281,14 @@ class _Hand:
         keys: Keys | None = None,
         max_p_slip: float = 0.5,
     ) -> None:
-        """`max_age_ms` is how old a reading may be that a lift relies on, ms.
+        """`max_age_ms`: largest age of a reading that permits a lift, ms.
 
-        With `ask_endpoint` (`[ask]`), `may_i_lift` asks for a judgement as well, and `tell` has
-        a peer to tell. `same_computer` says whether the daemon's monotonic clock is one's own;
-        unless given, it is with `ipc://` and on loopback addresses: say False through a tunnel.
-        A `stable` with a `p_slip` of `max_p_slip` or more is none: say the scene's `slip_threshold`
-        if that is higher. Raises `zmq.ZMQError` for an endpoint, `TypeError` for one that is not
-        text, `ValueError` for an age or a probability that is none.
+        `ask_endpoint` (`[ask]`): socket at which `may_i_lift` asks for a judgement and `tell`
+        reports. `same_computer`: True if the daemon's monotonic clock is also the client's. None:
+        True for `ipc://` and loopback addresses, so pass False for a tunnel. `max_p_slip`: a
+        `stable` with this `p_slip` or more counts as unknown; pass the scene's `slip_threshold` if
+        that is higher. Raises `zmq.ZMQError` for a wrong endpoint, `TypeError` for one that is not
+        text, and `ValueError` for an invalid age or probability.
         """
         for name, text in (("endpoint", endpoint), ("hand", hand), ("ask_endpoint", ask_endpoint)):
             if not isinstance(text, str) and (name, text) != ("ask_endpoint", None):
@@ -304,17 +306,17 @@ class _Hand:
         self._closed = self._behind = False
         self._pid = os.getpid()
         self._turn = threading.Lock()
-        """Held by the call that is under way."""
+        """Lock that a running call holds."""
         self._lifts: dict[tuple[str, int], bool] = {}
-        """Grasps whose lift was allowed, the oldest first, and whether graspd has the outcome."""
+        """Grasps whose lift was allowed, the oldest first; True if graspd has the outcome."""
         self._last = self._telling = "", 0
-        """The one that was allowed last, and the one that is being told."""
+        """Last grasp that was allowed to be lifted, and the one whose outcome is being reported."""
         self._told = OutcomeAnswer("no-answer")
         self._forgotten, self._warn_at = 0, 1
         self._returned = "", 0
         """Grasp that `wait_for_grasp` returned last."""
         self._link = _Link(endpoint, topic, ask_endpoint, keys)
-        # A context that is collected as garbage no longer knows its sockets, and waits for them.
+        # A garbage-collected context would wait for its sockets, which it no longer knows.
         weakref.finalize(self, _close_in, os.getpid(), self._link).atexit = False
         self._compares_clocks = self._asks and not same_computer
         self._clock_asked_ns: int | None = None
@@ -324,15 +326,15 @@ class _Hand:
 
     @property
     def counts(self) -> Counts:
-        """Numbers of messages so far."""
+        """Return the numbers of messages so far."""
         return self._newest.counts
 
     @property
     def unreported(self) -> int:
-        """Lifts that were allowed before the last one, and of which graspd has no outcome.
+        """Number of lifts, before the last allowed one, of which graspd has no outcome.
 
-        It cannot learn from them. With `[risk]`, one that is forgotten counts as a slip. The logger
-        `graspd_client` warns of the first one and of each tenth.
+        It cannot learn from them. With `[risk]` a lift that is never reported counts as a slip. The
+        logger `graspd_client` warns of the first one and of each tenth.
         """
         untold = (key != self._last for key, told in self._lifts.items() if not told)
         return self._forgotten + sum(untold)
@@ -397,7 +399,7 @@ class _Hand:
             now_ns = time.monotonic_ns()
             touching = _feeling(newest, FingerState.TOUCH)
             felt = set((newest.fingers or {}).items())
-            if not is_first:  # what came before the first look was before the lift
+            if not is_first:  # messages before the first look are from before the lift
                 felt |= self._newest.passed
             is_first = False
             sliding = tuple(sorted(finger for finger, state in felt if state == FingerState.SLIDE))
@@ -435,7 +437,7 @@ class _Hand:
     def close(self) -> None:
         """Close the sockets. May be called again; every verdict is unknown from then on.
 
-        A call that is under way, of another thread or task, ends soon and closes them.
+        A running call in another thread or task ends soon and closes them.
         """
         if not self._closed and os.getpid() == self._pid:
             self._closed = True
@@ -470,7 +472,7 @@ class _Hand:
                 self._close_if_idle()
 
     def _allow(self, lift: tuple[str, int]) -> None:
-        """The hand lifts this grasp; what was lifted before is over, and should have been told."""
+        """Note that the hand may lift this grasp. The outcome of the lift before is now overdue."""
         self._last = lift
         if lift[1]:
             self._lifts.setdefault(lift, False)
@@ -481,7 +483,7 @@ class _Hand:
             log.warning("%d lifts were allowed, and their outcome not told", self.unreported)
 
     def _hear(self) -> None:
-        """Take in the answer to an outcome, if it is there."""
+        """Take in the answer to an outcome, if it has arrived."""
         payload = self._link.telling.answer()
         if payload is None:
             return
@@ -512,7 +514,7 @@ class _Hand:
             calling.ask(b"clock")
 
     def _drain(self) -> bool:
-        """Read all that waits, without waiting; whether there was anything new."""
+        """Read all waiting messages without blocking; return True if one was new."""
         self._forget_what_is_old()
         self._hear()
         self._compare_clocks()
@@ -536,10 +538,8 @@ class _Hand:
         return new
 
     def _forget_what_is_old(self) -> None:
-        """Forget messages from before a sleep of the computer, or a long time without a look.
-
-        While the computer sleeps the monotonic clock stands still: all would look fresh.
-        """
+        """Forget messages from before a sleep of the computer, or a long time without a look. The
+        monotonic clock stops in a sleep, so all messages would look fresh."""
         slept_ns = _slept_ns()
         slept = slept_ns - self._slept_ns > SLEPT_NS
         self._slept_ns = max(self._slept_ns, slept_ns)
@@ -555,7 +555,7 @@ class _Hand:
         self._empty_ns = self._heard_ns = time.monotonic_ns()
 
     def _wait(self, due_ns: int, look_ns: int | None = None) -> Waits[bool]:
-        """Wait for a message, or until another look is due; False when it is time to end."""
+        """Wait for a message or until `look_ns`; return False at `due_ns`, the end of the call."""
         now_ns = time.monotonic_ns()
         if now_ns >= due_ns or self._closed:
             return False
@@ -573,46 +573,46 @@ class Client(_Hand):
     """Subscribes to the verdicts of one hand. Use it in one thread, and close it."""
 
     def verdict(self, wait_s: float = 0.0) -> Verdict:
-        """The newest verdict; waits at most `wait_s` seconds for a new message.
+        """Return the newest verdict; wait at most `wait_s` seconds for a new message.
 
-        Raises `ValueError` for a time that is none.
+        Raises `ValueError` for an invalid time.
         """
         return self._finish(self._verdict(_due_ns("wait_s", wait_s)))
 
     def may_i_lift(
         self, deadline_s: float, *, supervised: bool = False, still_ms: float | None = None
     ) -> LiftAnswer:
-        """Whether the current grasp is stable, known within `deadline_s` seconds from now.
+        """Return whether the current grasp may be lifted, within `deadline_s` seconds from now.
 
-        Waits for a fresh `stable`, or `slip`. With an ask endpoint the daemon is asked, and the
-        answer and the newest message of the same grasp must both say so; an unknown answer is asked
-        for again. Whatever else happens until the deadline is a no. Say `supervised` only while a
-        person watches: then what graspd wants to learn from (in the warm-up, and now and then
-        after it) may be lifted too if it is not `early`, and the answer says that it is such a
-        lift. With `still_ms` the hand must have been still for this time as well, ms, and a daemon
-        that does not say so gets a no; without it, what the daemon calls `stable` is enough, also
-        where it is `early`: its scene allows that.
-        Raises `ValueError` for a time that is none.
+        Waits for a fresh `stable` or `slip`. With an ask endpoint it asks the daemon, and the
+        answer and the newest message of the same grasp must both say `stable`; after an unknown
+        answer it asks again. Everything else until the deadline is a no. `supervised`: pass True
+        only while a person watches. A grasp from which graspd asks to learn, in the warm-up and
+        sometimes later, may then be lifted if it is not `early`; the answer has `supervised`.
+        `still_ms`: time, ms, for which the hand must have been still; a daemon that does not report
+        it gets a no. None: `stable` is enough, even if `early`, because its scene allows that.
+
+        Raises `ValueError` for an invalid time.
         """
         return self._finish(self._may_i_lift(deadline_s, supervised, still_ms))
 
     def wait_for_grasp(self, deadline_s: float, *, supervised: bool = False) -> Verdict | None:
-        """The verdict on the next grasp that is surely judged; None if there is none in time.
+        """Return the verdict on the next grasp once it is judged for sure; None: none in time.
 
-        Waits at most `deadline_s` seconds for a `stable` or a `slip` of a grasp that this method
-        has not returned before. With `supervised` it also returns what a person who watches may
-        lift. It never returns what is `early`. It asks nothing: before the lift, ask `may_i_lift`.
-        Raises `ValueError` for a time that is none.
+        Waits at most `deadline_s` seconds for a `stable` or `slip` of a grasp that this method has
+        not returned before. With `supervised` it also returns grasps to be lifted while a person
+        watches. It never returns an `early` verdict. It asks nothing: call `may_i_lift` before the
+        lift. Raises `ValueError` for an invalid time.
         """
         return self._finish(self._wait_for_grasp(deadline_s, supervised))
 
     def wait_for_slide(self, timeout_s: float) -> SlideAnswer:
         """Watch over a lift: wait until something slides, at most `timeout_s` seconds.
 
-        It ends at once when a finger says `slide`, when one that touched at first is `free`, and
-        when another grasp is at hand. It ends too when for `max_age_ms` no reading said that all
-        that touched at first still do: what is not known may slide. Raises `ValueError` for a time
-        that is none.
+        It ends at once when a finger has the state `slide`, when one that touched at first is
+        `free`, and when another grasp begins. It also ends when for `max_age_ms` no reading showed
+        that all fingers that touched at first still do, as something may slide unseen. Raises
+        `ValueError` for an invalid time.
         """
         return self._finish(self._wait_for_slide(timeout_s))
 
@@ -623,14 +623,14 @@ class Client(_Hand):
         object_name: str | None = None,
         wait_s: float = 2.0,
     ) -> OutcomeAnswer:
-        """Tell how the lift ended that was made on a verdict, and what was lifted.
+        """Report how the lift made on the verdict `lifted_on` ended, and the name of the object.
 
-        Tell `Outcome.NOT_LIFTED` if no lift followed a yes: else graspd waits for an outcome.
-        Waits at most `wait_s` seconds: graspd answers once it is written to disk. An answer that
-        comes later is taken in by later calls; without one, tell it again. Raises `ValueError`
-        without an ask endpoint, for a verdict that is of no grasp, for an `Outcome` or a time that
-        is none, and for a name that is not 1 to 64 letters (ASCII), digits, `_`, `-`, `.`, or
-        begins with one of the last two.
+        Report `Outcome.NOT_LIFTED` if no lift followed a yes; otherwise graspd waits for an
+        outcome. Waits at most `wait_s` seconds: graspd answers once the outcome is on its disk.
+        Later calls take in a late answer; without one, report again. Raises `ValueError` without an
+        ask endpoint, for a verdict without a grasp, for an invalid outcome or time, and for a name
+        that is not 1 to 64 letters (ASCII), digits, `_`, `-`, `.`, or that begins with one of the
+        last two.
         """
         return self._finish(self._tell(lifted_on, how, object_name, wait_s))
 
@@ -652,12 +652,12 @@ class Client(_Hand):
 
 
 class AsyncClient(_Hand):
-    """`Client` for asyncio: the same rules, and what waits there is awaited here.
+    """`Client` for asyncio: the same rules, with methods to await where `Client` waits.
 
     A call sleeps until a socket wakes the loop, and may be cancelled.
     """
 
-    _woken: Any = None  # a future: who waits
+    _woken: Any = None  # future of the waiting task
 
     async def verdict(self, wait_s: float = 0.0) -> Verdict:
         """As `Client.verdict`."""
@@ -715,14 +715,14 @@ class AsyncClient(_Hand):
         for descriptor in descriptors:
             loop.add_reader(descriptor, self._wake)
         timer = loop.call_later(timeout_s, self._wake)
-        # A descriptor tells only of what comes later. To ask for `EVENTS` makes it tell.
+        # The descriptor only signals later messages. Reading `EVENTS` rearms it.
         if any(int(each.EVENTS) & zmq.POLLIN for each in sockets):
             self._wake()
         try:
             await self._woken
         finally:
             timer.cancel()
-            self._refuse_fork()  # and leave the loop's selector, which is the parent's too
+            self._refuse_fork()  # the loop's selector is also the parent's
             for descriptor in descriptors:
                 loop.remove_reader(descriptor)
 
@@ -741,58 +741,58 @@ class _Message(NamedTuple):
     """Used fields of a verdict message."""
 
     verdict: Verdict  # without its age
-    read_ns: int  # by the daemon's monotonic clock: when the reading's last byte came ...
-    published_ns: int  # ... and when the message went out
+    read_ns: int  # time of the reading's last byte, by the daemon's monotonic clock
+    published_ns: int  # time of sending the message, by the same clock
     silence_ns: int
 
 
 class Newest:
-    """State by the newest message, without socket and clock."""
+    """State of a hand by its newest message; it has neither socket nor clock."""
 
     def __init__(
         self, topic: bytes, max_age_ns: int, same_computer: bool, max_p_slip: float = 0.5
     ) -> None:
-        """`topic` is the hand's; other messages are passed over."""
+        """`topic`: the hand's topic; messages with another are ignored."""
         self.counts = Counts()
         self.passed: set[tuple[str, FingerState | None]] = set()
-        """Words of each finger in the messages of the last look."""
+        """State of each finger in the messages of the last look."""
         self._topic, self._max_age_ns, self._same_computer = topic, max_age_ns, same_computer
         self._max_p_slip = max_p_slip
         self._message: _Message | None = None
         self._published_ns: int | None = None
-        """Latest time, by the own clock, when the message was published; None: not known."""
+        """Latest possible time of the message's publication (own clock), ns; None: not known."""
         self._why = "no-message"
-        """Why there is no message."""
+        """Reason why no message is known."""
         self._boot_id: str | None = None
         self._seq = -1
         self._former: deque[str] = deque(maxlen=FORMER_MAX)
         self._ended: dict[tuple[str, int], None] = {}
-        """Grasps whose outcome was told, the oldest first, at most `LIFTS_MAX`."""
+        """Grasps whose outcome was reported, the oldest first, at most `LIFTS_MAX`."""
         self._best: tuple[int, int] | None = None
-        """The fastest way of a message so far, as the difference of the clocks, and when, ns."""
+        """Smallest difference of arrival and publication so far, and its time, ns; None: none."""
         self._least_ns = 0
-        """The least of these differences."""
+        """Smallest of all these differences, ns."""
         self._bound: tuple[int, int] | None = None
-        """Least difference of the clocks, by the daemon's own, and when it was told, ns."""
+        """Lower bound of the clocks' difference by the daemon's answer, and its time, ns."""
 
     @property
     def silence_ns(self) -> int:
-        """For how long no message may come; 0 without one."""
+        """Longest time without a message before the grasp is unknown, ns; 0 without a message."""
         return 0 if self._message is None else self._message.silence_ns
 
     @property
     def needs_arrival(self) -> bool:
-        """Whether the age of the next message rests on the time when it comes."""
+        """Return True if the age of the next message is computed from its arrival."""
         knows_clock = self._same_computer or self._bound is not None
         return not knows_clock and self._best is not None
 
     def forget(self, why: str) -> None:
-        """Forget the message and the clocks' difference, but not what repeats are."""
+        """Forget the message and the clocks' difference; still recognise repeats. `why`: reason."""
         self._message, self._why = None, why
         self._best = self._bound = None
 
     def compare_clocks(self, asked_ns: int, told_ns: int) -> None:
-        """The daemon's clock read `told_ns` at some time after `asked_ns` (own clock)."""
+        """Note that the daemon's clock read `told_ns` at some time after `asked_ns` (own clock)."""
         least_ns = asked_ns - told_ns
         if self._bound is not None:
             least_ns = max(least_ns, self._at_least(self._bound, asked_ns))
@@ -800,13 +800,14 @@ class Newest:
 
     @staticmethod
     def _at_least(bound: tuple[int, int], now_ns: int) -> int:
-        """Least difference of the clocks at `now_ns`, ns: they may have drifted since `bound`."""
+        """Return the lower bound of the clocks' difference at `now_ns`, ns, with drift since
+        `bound`."""
         return bound[0] - round((now_ns - bound[1]) * DRIFT)
 
     def take(self, frames: Sequence[bytes], empty_ns: int, now_ns: int) -> bool:
-        """Take in a message, which came after `empty_ns` and not after `now_ns` (own clock).
+        """Take in a message that arrived after `empty_ns` and by `now_ns` (own clock).
 
-        Whether it is a new one. A repeated one is not; one that is not understood is.
+        Return False for a repeated message, True for a new one, understood or not.
         """
         if not frames or frames[0] != self._topic:
             return False
@@ -825,7 +826,7 @@ class Newest:
         return True
 
     def at(self, now_ns: int) -> Verdict:
-        """Return the verdict at a time of the own clock."""
+        """Return the verdict that holds at `now_ns` (own clock)."""
         message = self._message
         if message is None:
             return Verdict(Decision.UNKNOWN, (self._why,))
@@ -845,20 +846,20 @@ class Newest:
         return self.if_open(said)
 
     def end(self, grasp: tuple[str, int]) -> None:
-        """The outcome of a grasp was told: nothing of it is to be lifted again."""
+        """Note that the outcome of a grasp was reported, so it must not be lifted again."""
         self._ended.pop(grasp, None)
         self._ended[grasp] = None
         if len(self._ended) > LIFTS_MAX:
             del self._ended[next(iter(self._ended))]
 
     def if_open(self, said: Verdict) -> Verdict:
-        """A verdict, unknown if it is known of a grasp whose outcome was told."""
+        """Return the verdict, as unknown if the outcome of its grasp was reported."""
         is_offered = said.decision != Decision.UNKNOWN or said.supervised
         ended = is_offered and _key(said) in self._ended
         return said.unknown("outcome-told") if ended else said
 
     def read(self, payload: bytes) -> _Message | str:
-        """A message or an answer; `malformed` or `version` for what is not understood, counted."""
+        """Return a message or an answer; count others and return `malformed` or `version`."""
         try:
             told = _parsed(payload)
             if _number(told, "v") == VERSION:
@@ -870,7 +871,7 @@ class Newest:
         return why
 
     def _if_sure(self, found: _Message) -> _Message:
-        """A message, unknown if it calls stable what more likely slips."""
+        """Return the message, as unknown if it is `stable` with a `p_slip` that is too high."""
         said = found.verdict
         slips = said.p_slip is not None and said.p_slip >= self._max_p_slip
         if said.decision == Decision.STABLE and slips:
@@ -897,17 +898,15 @@ class Newest:
         return True
 
     def _is_older(self, found: _Message) -> bool:
-        """Whether it went out before what is known, of a start that so is not the newest."""
+        """Return True if it was sent before the known message, so its start is not the newest."""
         known_ns = self._published_ns if self._same_computer else None
         return known_ns is not None and found.published_ns < known_ns
 
     def _by_arrival(self, published_ns: int, empty_ns: int, now_ns: int) -> int | None:
-        """When a message went out, by one's own clock: what it took longer than the fastest is age.
-
-        None for the first: it may have been kept for those who come late.
-        """
+        """Return when a message was sent, by the own clock, as if the fastest one took no time.
+        None for the first one, which may have been kept for late subscribers."""
         difference_ns = now_ns - published_ns
-        if self._bound is not None:  # no earlier, however long it then waited to be read
+        if self._bound is not None:  # the bound holds however long it waited here
             return min(published_ns + self._at_least(self._bound, now_ns), now_ns)
         if self._best is None:
             self._best, self._least_ns = (difference_ns, now_ns), difference_ns
@@ -920,7 +919,7 @@ class Newest:
         return min(empty_ns, now_ns - max(late_ns, 0))
 
     def _may_have_crept(self) -> bool:
-        """Whether messages may take much longer than they did, and only the clocks differ."""
+        """Return True if messages' delay may have grown unnoticed, like a drift of the clocks."""
         if self._bound is not None or self._best is None:
             return False
         return self._best[0] - self._least_ns > DRIFT_MAX_NS
@@ -936,18 +935,18 @@ class _Question:
         self._still_ms = still_ms
         self._asked = self._heard = self._may_be_announced = False
         self._answer: Verdict | None = None
-        """Answer that the newest message must confirm."""
+        """Answer that the newest message must confirm; None: no answer yet."""
 
     def permits(self, said: Verdict) -> bool:
-        """Whether a verdict lets the hand lift."""
+        """Return True if a verdict lets the hand lift."""
         return bool(said) or (self._supervised and said.supervised)
 
     def is_over(self, said: Verdict) -> bool:
-        """Whether there is no need to wait."""
+        """Return True if the verdict decides, so that waiting can end."""
         return said.decision == Decision.SLIP or self.permits(said)
 
     def decided(self, newest: Verdict) -> Verdict:
-        """The newest message, if it confirms the answer; nothing to lift on otherwise. Asks."""
+        """Return the newest verdict if it confirms the answer, else an unknown; ask if needed."""
         newest = self._if_still(newest)
         if self._asking is None:
             return newest
@@ -980,16 +979,15 @@ class _Question:
         return newest.unknown(*(newest.reasons or ("no-answer",)))
 
     def at_the_end(self, said: Verdict) -> Verdict:
-        """Return the decision; without a lift or an answer it has `no-answer` too."""
+        """Return the decision at the deadline, with `no-answer` if no lift and no answer came."""
         if self._asking is None or self._heard or said.seq is None or self.is_over(said):
             return said
         return replace(said, reasons=tuple(dict.fromkeys([*said.reasons, "no-answer"])))
 
     def _if_still(self, said: Verdict) -> Verdict:
-        """Return a verdict, unknown if it permits a lift before the hand was still for long enough.
-
-        A lift under supervision must not be early; any lift needs `still_ms` of stillness.
-        """
+        """Return the verdict, as unknown if it permits a lift but the hand was not still long
+        enough. A lift under supervision must not be early; any lift needs `still_ms` of
+        stillness."""
         if not self.permits(said):
             return said
         least_ms, is_early = self._still_ms, said.supervised and said.early
@@ -998,17 +996,17 @@ class _Question:
 
 
 def _was_stable(said: Verdict) -> bool:
-    """Whether the daemon said `stable`, even if `p_slip` is too high."""
+    """Return True if the daemon said `stable`, even if `p_slip` is too high."""
     return said.decision == Decision.STABLE or said.reasons == ("p-slip",)
 
 
 def _reaches(newest: Verdict, answer: Verdict) -> bool:
-    """Whether the message that is the answer is no longer to come."""
+    """Return True if the newest message is at least as new as the answer."""
     return newest.boot_id == answer.boot_id and (newest.seq or 0) >= (answer.seq or 0)
 
 
 class _Link:
-    """The sockets."""
+    """The sockets of a client."""
 
     def __init__(self, endpoint: str, topic: bytes, ask: str | None, keys: Keys | None) -> None:
         self._endpoint, self._topic, self._keys = endpoint, topic, keys
@@ -1023,7 +1021,7 @@ class _Link:
             raise
 
     def receive(self) -> list[bytes] | None:
-        """The next message, if one waits."""
+        """Return the next message; None: none waits."""
         try:
             return self._socket.recv_multipart(zmq.NOBLOCK)
         except zmq.Again:
@@ -1031,7 +1029,7 @@ class _Link:
 
     @property
     def sockets(self) -> list[zmq.Socket[bytes]]:
-        """Those on which a message or an answer may come."""
+        """Return the sockets on which a message or an answer may arrive."""
         sockets = (self._socket, self.asking.socket, self.telling.socket, self.timing.socket)
         return [each for each in sockets if each is not None]
 
@@ -1045,7 +1043,7 @@ class _Link:
         self._socket = self.connected(zmq.SUB, self._endpoint)
 
     def leave(self, socket: zmq.Socket[bytes]) -> None:
-        """Keep a socket open while its last message is sent."""
+        """Keep a socket open until its last message is sent."""
         self._leaving.append(socket)
         if len(self._leaving) > LEAVING_MAX:
             self._leaving.popleft().close(0)
@@ -1066,7 +1064,7 @@ class _Link:
             made.heartbeat_ivl, made.heartbeat_timeout = HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS
         if kind == zmq.SUB:
             made.subscribe(self._topic)
-        else:  # graspd knows the client by the name, and each connection by the number after it
+        else:  # the name identifies the client, the number after it the connection
             self._calls += 1
             made.routing_id = self._name + self._calls.to_bytes(8, "big")
         made.connect(endpoint)
@@ -1080,7 +1078,7 @@ def _close_in(process: int, link: _Link) -> None:
 
 
 class _Call:
-    """Something that is said to the daemon, on a socket of its own, until it has answered."""
+    """A request to the daemon, on its own socket, until it is answered."""
 
     def __init__(self, link: _Link, endpoint: str) -> None:
         self._link, self._endpoint = link, endpoint
@@ -1092,7 +1090,7 @@ class _Call:
         self.socket.send(question, zmq.NOBLOCK)
 
     def answer(self) -> bytes | None:
-        """The answer, if it is there; empty if it is none."""
+        """Return the answer; None: not yet; b"": it is not an answer."""
         try:
             frames = [] if self.socket is None else self.socket.recv_multipart(zmq.NOBLOCK)
         except zmq.Again:
@@ -1100,9 +1098,9 @@ class _Call:
         return None if self.socket is None else frames[0] if len(frames) == 1 else b""
 
     def hang_up(self, *, lifts: bool = True) -> None:
-        """An answer that is late must not be mistaken for one to the next question.
+        """Close the socket, so that a late answer is not mistaken for one to the next question.
 
-        Unless the hand `lifts`, the daemon is told to await no outcome of what was asked.
+        `lifts`: False tells the daemon that no lift follows, so it awaits no outcome.
         """
         leaving, self.socket = self.socket, None
         if leaving is None:
@@ -1116,7 +1114,7 @@ class _Call:
 
 
 def is_same_computer(endpoint: str) -> bool:
-    """Whether an endpoint can only be of this computer."""
+    """Return True if an endpoint can only be on this computer."""
     return endpoint.startswith(("ipc://", "tcp://127.", "tcp://[::1]", "tcp://localhost:"))
 
 
@@ -1128,14 +1126,14 @@ def _due_ns(name: str, seconds: float) -> int:
 
 
 def _is_amount(value: object, most: float = REAL_MAX) -> bool:
-    """Whether it is a number from 0 to `most`."""
+    """Return True if `value` is a number from 0 to `most`."""
     if isinstance(value, bool) or not isinstance(value, Real):
         return False
     return not value < 0 and bool(value <= most)
 
 
 def _slept_ns() -> int:
-    """How long the computer has slept, and something constant: only the first clock counts that."""
+    """Return the time slept plus a constant, ns: the difference of two clocks."""
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.monotonic_ns()
 
 
@@ -1153,7 +1151,7 @@ def _parsed(payload: bytes) -> dict[str, Any]:
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return the object. Raises `ValueError` for a key twice: readers differ in which one holds."""
+    """Return the object. Raises `ValueError` for a repeated key, of which readers differ."""
     found = dict(pairs)
     if len(found) != len(pairs):
         raise ValueError
@@ -1177,7 +1175,7 @@ def _message(told: dict[str, Any]) -> _Message:
     )
     if not fits:
         raise ValueError
-    told = {"p_slip_model": None, "outcomes": 0, "risk": None, **told}  # older daemons have none
+    told = {"p_slip_model": None, "outcomes": 0, "risk": None, **told}  # older daemons lack these
     read_ns, seq, grasp, outcomes = _numbers(told, "t_mono_ns", "seq", "grasp", "outcomes")
     age_ms, silence_ms = _real(told, "age_ms"), _real(told, "silence_ms")
     p_slip, p_model = (_maybe(told, name, 1) for name in ("p_slip", "p_slip_model"))
@@ -1190,7 +1188,7 @@ def _message(told: dict[str, Any]) -> _Message:
 
 
 def _with_stillness(said: Verdict, told: dict[str, Any]) -> Verdict:
-    """With what is told of it; older daemons tell nothing."""
+    """Return the verdict with the message's stillness and motion, which older daemons lack."""
     told = {"early": False, "still_ms": None, "motion": None, "motion_limits": None, **told}
     told = {"fingers": None, "owner": None, **told}
     if not isinstance(told["early"], bool) or not isinstance(told["owner"], (str, type(None))):
@@ -1207,7 +1205,7 @@ def _with_stillness(said: Verdict, told: dict[str, Any]) -> Verdict:
 
 
 def _by_finger(told: Any, read: Callable[[dict[str, Any], str], Any]) -> Any:  # noqa: ANN401
-    """An object, all of whose values can be read so; None for none."""
+    """Return an object by finger, each value read by `read`; None for null."""
     if told is None:
         return None
     if not isinstance(told, dict):
@@ -1220,19 +1218,19 @@ def _finger_state(told: dict[str, Any], finger: str) -> FingerState | None:
 
 
 def _feeling(said: Verdict, state: FingerState) -> tuple[str, ...]:
-    """The fingers that feel it."""
+    """Return the fingers in this state."""
     return tuple(finger for finger, felt in (said.fingers or {}).items() if felt == state)
 
 
 def _unfelt(said: Verdict) -> Verdict:
-    """A verdict by which it is not known what the fingers feel now."""
+    """Return the verdict with the state of all fingers unknown."""
     return replace(said, fingers=None if said.fingers is None else dict.fromkeys(said.fingers))
 
 
 def _risk(told: Any) -> Risk:  # noqa: ANN401
     if not isinstance(told, dict):
         raise ValueError
-    told = {"announced": 0, "awaited": 0, **told}  # older daemons tell nothing
+    told = {"announced": 0, "awaited": 0, **told}  # older daemons lack these
     lifts, slips, out, left = _numbers(told, "lifts", "slips", "outstanding", "warm_up_left")
     announced, awaited = _numbers(told, "announced", "awaited")
     if slips > lifts:
@@ -1255,12 +1253,12 @@ def _telling(lifted_on: Verdict, how: Outcome, object_name: str | None) -> bytes
 
 
 def _key(lifted_on: Verdict) -> tuple[str, int]:
-    """Names a grasp; empty and 0 where there is none."""
+    """Return `boot_id` and number of the verdict's grasp; ("", 0) without one."""
     return lifted_on.boot_id or "", lifted_on.grasp or 0
 
 
 def _taken(payload: bytes) -> OutcomeAnswer:
-    """The answer to an outcome; `malformed` or `version` for what is not understood."""
+    """Return the answer to an outcome, with `malformed` or `version` if it is not understood."""
     try:
         told = _parsed(payload)
         if _number(told, "v") != VERSION:
@@ -1273,7 +1271,7 @@ def _taken(payload: bytes) -> OutcomeAnswer:
 
 
 def _told_clock(payload: bytes) -> int | None:
-    """The daemon's clock, ns; None for what is not understood."""
+    """Return the daemon's clock, ns; None if the answer is not understood."""
     try:
         told = _parsed(payload)
         return _number(told, "t_mono_ns") if _number(told, "v") == VERSION else None
@@ -1296,7 +1294,7 @@ def _maybe(told: dict[str, Any], name: str, most: float = REAL_MAX) -> float | N
 def _number(
     told: dict[str, Any], name: str, most: float = INTEGER_MAX, kinds: tuple[type, ...] = (int,)
 ) -> Any:  # noqa: ANN401
-    """Return a value of one of these types (bool is none), from 0 to `most`."""
+    """Return a value of one of these types, but not bool, from 0 to `most`."""
     value = told[name]
     if type(value) not in kinds or not 0 <= value <= most:
         raise ValueError

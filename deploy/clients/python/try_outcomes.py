@@ -1,4 +1,4 @@
-"""Ask to lift the grasps of deploy/clients/loop.toml, and tell the outcome that you type.
+"""Ask to lift the grasps of deploy/clients/loop.toml, and report the outcome that you type.
 
 `graspd run deploy/clients/loop.toml`, then `python try_outcomes.py` with any Python that has pyzmq.
 """
@@ -28,7 +28,7 @@ def asked() -> Outcome:
 
 
 def main() -> None:
-    """Ask and tell until the input ends."""
+    """Ask and report until the input ends."""
     with Client(VERDICTS, ask_endpoint=QUESTIONS) as client:
         while True:
             answer = client.may_i_lift(10.0, supervised=True)

@@ -7,15 +7,15 @@ import rospy
 from sensor_msgs.msg import JointState
 from sr_robot_msgs.msg import BiotacAll
 
-ORDER = ["ff", "mf", "rf", "lf", "th"]  # of BiotacAll.tactiles
+ORDER = ["ff", "mf", "rf", "lf", "th"]  # fingers of BiotacAll.tactiles
 rospy.init_node("graspd_feeder")
 SIDE = rospy.get_param("~side", "rh")
 HAND = rospy.get_param("~hand", "left" if SIDE == "lh" else "right")
 FINGERS = rospy.get_param("~fingers", "ff mf th").split()
 ADDRESS = rospy.get_param("~address", "127.0.0.1")
-PORT = rospy.get_param("~port", 9872)  # of the counts; that of the joints is one less
+PORT = rospy.get_param("~port", 9872)  # port of the counts; the joints' port is one less
 SENDER = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-SENDER.bind(("", PORT + 1))  # fixed: counts that come from another port are of other sensors
+SENDER.bind(("", PORT + 1))  # fixed, as counts from another port are of other sensors
 
 
 def _send(port: int, message: object, **values: object) -> None:

@@ -8,16 +8,16 @@ from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import JointState
 from sr_robot_msgs.msg import BiotacAll
 
-ORDER = ["ff", "mf", "rf", "lf", "th"]  # of BiotacAll.tactiles
+ORDER = ["ff", "mf", "rf", "lf", "th"]  # fingers of BiotacAll.tactiles
 rclpy.init()
 NODE = rclpy.create_node("graspd_feeder")
 SIDE = NODE.declare_parameter("side", "rh").value
 HAND = NODE.declare_parameter("hand", "left" if SIDE == "lh" else "right").value
 FINGERS = NODE.declare_parameter("fingers", "ff mf th").value.split()
 TO = NODE.declare_parameter("address", "127.0.0.1").value
-PORT = NODE.declare_parameter("port", 9872).value  # of the counts; the joints' is one less
+PORT = NODE.declare_parameter("port", 9872).value  # port of counts; joints: one less
 SENDER = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-SENDER.bind(("", PORT + 1))  # fixed: counts that come from another port are of other sensors
+SENDER.bind(("", PORT + 1))  # fixed, as counts from another port are of other sensors
 
 
 def _send_counts(message: BiotacAll) -> None:

@@ -1,7 +1,5 @@
-"""A ROS 2 node: publishes what graspd decides, answers whether to lift, tells how a lift ended.
-
-Copy ../python/graspd_client.py beside it: `python3 grasp_node.py --ros-args -p endpoint:=...`.
-"""
+"""A ROS 2 node: publishes verdicts, answers whether to lift, reports how a lift ended. Copy
+../python/graspd_client.py beside it: `python3 grasp_node.py --ros-args -p endpoint:=...`."""
 
 from __future__ import annotations
 
@@ -13,7 +11,7 @@ from std_srvs.srv import SetBool, Trigger
 
 
 class GraspNode(Node):
-    """The topic is for people to see; a lift relies on the service alone."""
+    """Publishes verdicts for people to see; a lift must rely on the service alone."""
 
     def __init__(self) -> None:
         super().__init__("graspd")

@@ -13,7 +13,7 @@ Range = tuple[float, float]
 FINGER_LEAD_S = 0.05
 """Longest time, s, by which a finger stops closing before the last one."""
 CREEP_SHARE: Range = (0.05, 0.07)
-"""Share of the deviation still missing when closing ends; skin and fluid yield slowly."""
+"""Share of the final deviation from rest that is missing when closing ends, due to creep."""
 CREEP_TAU_S: Range = (0.10, 0.14)
 """Time constant of that creep, s."""
 LOAD_COUNTS: Range = (20.0, 60.0)
@@ -23,7 +23,7 @@ LOAD_S = 0.15
 SLIPPING_ELECTRODES = 0.5
 """Share of the electrodes that lose contact in a slip, because the object tilts."""
 SLIP_LOSS: Range = (0.3, 0.6)
-"""Share of the deviation that an electrode loses in a slip."""
+"""Share of its deviation from rest that an electrode loses in a slip."""
 SLIP_STEPS = (2, 4)
 """Fewest and most slips of an object that slides; each is over within a sweep."""
 SLIP_WINDOW: Range = (0.1, 0.7)
@@ -44,17 +44,17 @@ class Durations:
     approach_s: Range = (0.4, 0.7)
     """Time in which the joints move and touch nothing."""
     touch_s: Range = (0.03, 0.15)
-    """From the first touch of a finger to the last."""
+    """Time from the first finger's touch to the last finger's."""
     close_s: Range = (0.25, 0.5)
-    """From the last touch to the end of closing."""
+    """Time from the last touch to the end of closing."""
     settle_s: Range = (0.6, 1.0)
-    """From the end of closing to the lift: five time constants of the creep, and time to judge."""
+    """Time from the end of closing to the lift: five time constants of creep, and time to judge."""
     lift_s: Range = (0.4, 0.6)
-    """From the start of the lift to the release."""
+    """Time from the start of the lift to the release."""
     release_s: Range = (0.2, 0.3)
-    """From the start of opening to no contact; faster than closing."""
+    """Time from the start of opening to no contact; faster than closing."""
     rest_s: Range = (0.8, 1.5)
-    """From the release to the next approach."""
+    """Time from the release to the next approach."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,7 +173,7 @@ class GraspScript:
             return nothing, losing * rng.uniform(*SLIP_LOSS, nothing.shape)
         deepest = np.abs(self._deviation).max(axis=1, keepdims=True)
         load = rng.uniform(*LOAD_COUNTS, deepest.shape)
-        # A finger bears at most the load that it presses with; without contact it bears none.
+        # The load on a finger is at most its own pressure, and 0 without contact.
         scale = np.divide(load, deepest, out=np.zeros_like(deepest), where=deepest >= load)
         return scale * self._deviation, nothing
 
@@ -195,6 +195,6 @@ def _touches(
 
 
 def _minimum_jerk(share: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the share of the way after a share of the time, 0..1 (Flash, Hogan 1985)."""
+    """Return the share of a motion that is done after a share of its time (Flash, Hogan 1985)."""
     share = np.minimum(np.maximum(share, 0.0), 1.0)
     return share * share * share * (10.0 + share * (6.0 * share - 15.0))

@@ -1,6 +1,6 @@
 """Streams of whole grasps: rest, approach, touch, close, settle, lift or slip, release.
 
-End points are rows of a grasp table, or drawn. The way between them is made up, with measured
+End points are rows of a grasp table, or drawn. The course between them is invented, with measured
 noise. Contact lowers counts, so a plausible end point is not above the rest; see `rest_above`.
 """
 
@@ -154,7 +154,7 @@ class WholeGrasps:
 class MeasuredNoise:
     """Gaussian noise, downward spikes of single electrodes, and the warm-up drift.
 
-    At most one electrode of a finger spikes in a sweep, and none twice in a row, as recorded.
+    As in recordings, at most one electrode of a finger spikes in a sweep, and never twice in a row.
     """
 
     def __init__(
@@ -185,8 +185,8 @@ class MeasuredNoise:
 class Sampler:
     """Sample a hand row by row, in order of time.
 
-    With `held`, rows of 100 Hz have values of 71.43 Hz, as recorded: 2 of 7 rows repeat a pair. An
-    electrode not sampled yet keeps its old value. Else all are sampled at the time of the row.
+    With `held`, rows at 100 Hz have values of 71.43 Hz as in recordings: 2 of 7 rows repeat values.
+    An electrode not sampled yet keeps its old value. Otherwise all are sampled at the row's time.
     """
 
     def __init__(self, rest: NDArray[np.float64], noise: Counting, *, held: bool = False) -> None:
