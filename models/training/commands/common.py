@@ -24,7 +24,7 @@ from graspd.models.training.systems.registry import SYSTEMS, System
 
 
 class WrongInputError(Exception):
-    """The command line names something missing, or does not fit the data."""
+    """The command line names a missing file, system or table, or does not fit the data."""
 
 
 def whole(low: int, high: int) -> Callable[[str], int]:
@@ -39,7 +39,7 @@ def whole(low: int, high: int) -> Callable[[str], int]:
 
 
 def add_shared_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of both commands."""
+    """Declare the options that `graspd train` and `graspd evaluate` share."""
     parser.add_argument("--quiet", action="store_true", help="show no progress bar")
     parser.add_argument(
         "--data",
@@ -118,7 +118,7 @@ def exit_code(
 def read_grasps(command: str, args: argparse.Namespace) -> Grasps:
     """Return the grasps of `--data` and `--own`. Raises `WrongInputError`, `DatasetError`.
 
-    Warns of tables with a published name that are not, byte for byte, the published ones.
+    Warns of tables that have a published name but differ from the published file.
     """
     if args.data is None and not args.own:
         raise WrongInputError("needs --data DIR, --own FILE, or both")

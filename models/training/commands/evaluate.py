@@ -1,4 +1,4 @@
-"""`graspd evaluate`: systems through protocols, figures and the reproduction table out."""
+"""`graspd evaluate`: run systems through protocols; write figures and RESULTS.md's table."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Evaluate; what is finished is kept and not run again.
+    """Evaluate; finished trainings are kept and not run again.
     Returns 0, 1 (a worker was lost), 2 (input or folder), 130 (Ctrl-C)."""
     if args.list:
         from graspd.models.training.systems.explained import TITLES, explained

@@ -55,7 +55,7 @@ from graspd.models.training.systems.registry import (
 SEEDS = 3
 """Split seeds of an evaluation unless `--seeds` says otherwise."""
 QUICK_GRASPS, QUICK_FOLDS, QUICK_EPOCHS = 200, 2, 1
-"""Grasps, folds and epochs of `--quick`: enough to see that all runs; figures mean nothing."""
+"""Grasps, folds and epochs of `--quick`, which only tests that all runs; figures mean nothing."""
 
 
 CONNECT_TIMEOUT_S = 10
@@ -64,7 +64,7 @@ VERDICTS = "verdicts"
 
 
 def evaluate(args: argparse.Namespace) -> None:
-    """Evaluate what the command line asks for. Raises what `exit_code` knows."""
+    """Evaluate as the command line says. Raises the errors that `exit_code` handles."""
     systems = _systems(args.names)
     if args.train or args.test or args.model:
         epochs = QUICK_EPOCHS if args.quick else None
@@ -121,7 +121,7 @@ def _systems(names: Sequence[str]) -> list[System]:
 
 
 def _protocols(args: argparse.Namespace, grasps: Grasps) -> list[EvalProtocol]:
-    """Return those that are asked for, or those that the tables are there for."""
+    """Return the requested protocols; without a request, all for which the tables exist."""
     if args.protocol or args.data is not None:
         return list(dict.fromkeys(args.protocol or PROTOCOLS))
     if len(set(grasps.objects)) > 1:
@@ -141,8 +141,8 @@ def _enough_folds(
     grasps: Grasps,
     seeds: range,
 ) -> int:
-    """Return the most folds, up to `folds`, that own grasps are enough for in every training.
-    Raises `TooFewGraspsError` if there are none."""
+    """Return the largest number of folds, up to `folds`, for which the user's grasps are enough.
+    Raises `TooFewGraspsError` if they are enough for none."""
     for system, protocol, seed in itertools.product(systems, protocols, seeds):
         plan, why = with_enough_folds(TrainingPlan(system, folds, seed, only=protocol), grasps)
         if why:
@@ -158,7 +158,7 @@ def _evaluated(
     grasps: Grasps,
     args: argparse.Namespace,
 ) -> list[Figures]:
-    """Run all jobs. The rows of a system in a protocol are kept and printed as soon as all are."""
+    """Run all jobs. Write and print the rows of a system in a protocol once these are complete."""
     groups = {
         (system.name, protocol): jobs_of(system, protocol, grasps, _seeds(args), folds)
         for system in systems
@@ -182,7 +182,7 @@ def _evaluated(
 
 
 def _announce(wanted: Sequence[Job], at_once: int) -> None:
-    """Say what will run, and about what each protocol and each system takes."""
+    """Print what will run, and about how long each protocol and each system takes."""
     jobs = [(job.protocol, job.system.name, quick_seconds(job.system)) for job in wanted]
     took = pd.DataFrame(jobs, columns=["protocol", "system", "seconds"])
     total = f"about {took['seconds'].sum():.0f} s of processor time"
@@ -207,7 +207,7 @@ def _show(one: Figures, args: argparse.Namespace) -> None:
 
 
 def _report(grasps: Grasps, args: argparse.Namespace) -> None:
-    """Write the table of all that the folder has of these grasps."""
+    """Write the table of all results in the folder that belong to these grasps."""
     digests = {
         name: digest(with_recipes(system, epochs=QUICK_EPOCHS) if args.quick else system)
         for name, system in SYSTEMS.items()
@@ -220,7 +220,7 @@ def _report(grasps: Grasps, args: argparse.Namespace) -> None:
 
 
 def _command(args: argparse.Namespace) -> Iterator[str]:
-    """Yield the words of the command line, without the folders of this machine."""
+    """Yield the words of the command line, without folders of this computer."""
     yield "evaluate"
     yield from args.names
     for protocol in args.protocol or ():

@@ -1,4 +1,4 @@
-"""`graspd evaluate --test`: grasps of one day judged by a model of another, as the daemon does."""
+"""`graspd evaluate --test`: judge one day's grasps with a model of another, as the daemon does."""
 
 from __future__ import annotations
 
@@ -39,15 +39,15 @@ class _Model:
     fingers: tuple[Finger, ...]
     known: known_grasps.Hashes
     judge: Callable[[], GraspJudge]
-    """Returns a judge that knows nothing of the day yet."""
+    """Function that returns a new judge, whose session is empty."""
 
 
 def judge_other_days(
     args: argparse.Namespace, systems: Sequence[System], epochs: int | None
 ) -> None:
-    """Print what `--model`, or each system by `--train`, is worth on each table of `--test`.
+    """Print the figures of `--model`, or of systems trained on `--train`, on each `--test` table.
 
-    No `systems`: the default one. `epochs` None: their own.
+    `systems`: empty for the default one. `epochs`: None for the systems' own.
     Raises `WrongInputError`, `DatasetError` and `ModelError`.
     """
     if not args.test or bool(args.train) == bool(args.model):
@@ -103,8 +103,8 @@ def _judge_of(trained: Trained) -> GraspJudge:
 
 
 def _figures(model: _Model, day: Grasps) -> dict[str, Any]:
-    """Judge the grasps of a table in their order, a session from nothing, and return the figures.
-    Warns of those that the model was trained on."""
+    """Judge the grasps of a table in order, from an empty session; return the figures. Warns of
+    grasps on which the model was trained."""
     table = day.files[0].name
     try:
         day = day.of_fingers(model.fingers)
@@ -130,7 +130,7 @@ def _figures(model: _Model, day: Grasps) -> dict[str, Any]:
 
 
 def _judged(judge: GraspJudge, day: Grasps) -> pd.DataFrame:
-    """Return a row for each grasp."""
+    """Return a table with a row for the verdict on each grasp."""
     margins, refused = np.zeros(len(day)), np.zeros(len(day), np.bool_)
     for index, counts in enumerate(day.counts):
         examined = judge.examine(counts)

@@ -102,7 +102,7 @@ def _train(args: argparse.Namespace, plan: TrainingPlan, out: Path) -> None:
                 say("train", f"takes {plan.folds} folds: {why}")
         else:
             preflight(plan, grasps)
-        # Now, not after minutes of training.
+        # Fail now, not after minutes of training.
         out.mkdir(parents=True, exist_ok=True)
         total = len(plan.jobs(grasps)) + EXTRA_TRAININGS
         with progress_bar(args.model, total, hidden=args.quiet) as on_job:

@@ -35,7 +35,7 @@ from graspd.models.training.evaluating.files import replacing, to_json, write_wh
 from graspd.models.training.fitting.novelty import seen_counts
 
 Train = Callable[[NDArray[np.uint16], NDArray[np.bool_]], bytes]
-"""Takes counts (n, fingers, 24) and slipped (n,); returns an ONNX file."""
+"""Function of counts (n, fingers, 24) and slipped (n,) that returns an ONNX file's bytes."""
 FLOAT_ERROR_MAX = 1e-4
 """Largest distance from 1 of two probabilities' sum."""
 ON_TABLE = "Measured on its own table alone: its worth on other objects and days is not known."
@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _measured(source: Path, grasps: Grasps) -> tuple[MeasuredError, onnx.ModelProto]:
-    """Return the error and the model; a Python file is trained by folds of objects, then on all
+    """Return measured error and model. A Python file is trained on folds of objects, then on all
     grasps."""
     if source.suffix != ".py":
         try:
@@ -183,10 +183,8 @@ def _answers(
 
 
 def _last(answer: str, read: NDArray[np.float32], graph: onnx.GraphProto) -> list[onnx.NodeProto]:
-    """Return the nodes from the network's answer to two probabilities.
-
-    `read`: its answers on the table, which say whether they are probabilities.
-    """
+    """Return the nodes that convert the network's output to two probabilities. `read`: its outputs
+    on the table, by which the form of the output is found."""
     if not np.isfinite(read).all():
         raise ModelError("the network answers grasps of the table with values that are not numbers")
     two = np.array([-1, read.shape[-1]], np.int64)

@@ -1,4 +1,4 @@
-"""Grasp tables (BTS3) into arrays: a row per grasp, read before the lift, labelled by the lift."""
+"""Read grasp tables (BTS3) into arrays: a row per grasp, with counts before the lift, outcome."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ Trained on 20 grasps of palm_45, the daemon refuses 98 % of the others as unlike
 
 
 DatasetError = RecordingError
-"""A grasp table is missing or is not what it claims to be. Give up until it is fixed."""
+"""A grasp table is missing or has wrong content. A retry cannot succeed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,7 +64,7 @@ class Grasps:
         return np.repeat(np.arange(len(self.files)), [file.rows for file in self.files])
 
     def rows(self, indices: Ints) -> Grasps:
-        """Return only these grasps, indices ascending. `files` keep digests and count these."""
+        """Return only these grasps, indices ascending. Rows in `files` then count only these."""
         kept = np.bincount(self.table_of[indices], minlength=len(self.files))
         return Grasps(
             self.counts[indices],
@@ -78,7 +78,7 @@ class Grasps:
         )
 
     def few(self) -> Grasps:
-        """Return every 20th grasp, enough to see that a report runs."""
+        """Return every 20th grasp, to try a report quickly."""
         return self.rows(np.arange(0, len(self), 20))
 
     def rows_of(self, tables: Collection[str]) -> Ints:
@@ -106,7 +106,7 @@ class Grasps:
 def read_table(path: Path, read_as: ReadAs | None = None) -> Grasps:
     """Read the grasps of one table that have an outcome.
 
-    `read_as="table"` decides for a table of which many rows repeat each other. Raises
+    Pass `read_as="table"` for a table in which many rows repeat each other. Raises
     `DatasetError`, with file, line and column.
     """
     data = _read(path)
@@ -144,7 +144,7 @@ def read_table(path: Path, read_as: ReadAs | None = None) -> Grasps:
 
 
 def table_name(path: Path) -> str:
-    """Return the name of a table: that of its file without the endings of packed files."""
+    """Return a table's name: its file's name without endings such as `.csv.gz`."""
     return Path(path.stem).stem if path.suffix == ".gz" else path.stem
 
 
@@ -177,9 +177,9 @@ def read_with_lab_tables(
 
 
 def concatenate(parts: Sequence[Grasps]) -> Grasps:
-    """Return the grasps of several tables, one after the other, with the fingers that all have.
+    """Return the grasps of several tables in order, with the fingers that all tables have.
 
-    Raises `DatasetError` if there are none.
+    Raises `DatasetError` if they have no finger in common.
     """
     has = set.intersection(*(set(part.fingers) for part in parts))
     fingers = tuple(finger for finger in parts[0].fingers if finger in has)
@@ -197,13 +197,13 @@ def concatenate(parts: Sequence[Grasps]) -> Grasps:
 
 
 def unpublished(files: Sequence[Dataset]) -> list[str]:
-    """Names of the files that are not, byte for byte, a published table."""
+    """Return the names of files that differ from every published table."""
     published = {(table.name, table.sha256) for table in TABLES}
     return [file.name for file in files if (file.name, file.sha256) not in published]
 
 
 def lab_table_names(files: Sequence[Dataset]) -> tuple[str, ...]:
-    """Names of the files that do not have the name of a published table, in their order."""
+    """Return the names of files that do not have a published table's name, in order."""
     published = {table.name for table in TABLES}
     return tuple(file.name for file in files if file.name not in published)
 
@@ -239,14 +239,14 @@ def _read_lab_table(path: Path, read_as: ReadAs | None) -> Grasps:
 
 
 def first_readings(counts: NDArray[np.uint16]) -> Ints:
-    """Return for each row the first one of its grasp, shape (N,): they nearly repeat each other."""
+    """Return for each row the first row that it nearly repeats, maybe by others, shape (N,)."""
     from sklearn.cluster import DBSCAN
 
     if not len(counts):
         return np.empty(0, dtype=np.int64)
     rows = counts.reshape(len(counts), -1).astype(np.float64)
     apart_max = NEAR_COUNTS * math.sqrt(rows.shape[1])
-    # Groups that are linked by near rows; the tree compares only rows of near places.
+    # Rows linked by near rows form a group; the tree compares only rows that may be near.
     linked = DBSCAN(apart_max, min_samples=1, algorithm="kd_tree").fit_predict(rows)
     _, first, of = np.unique(linked, return_index=True, return_inverse=True)
     found: Ints = first[of]
@@ -254,7 +254,7 @@ def first_readings(counts: NDArray[np.uint16]) -> Ints:
 
 
 def _check_once(grasps: Grasps, lab: dict[str, Path]) -> None:
-    """Raise `DatasetError` if a grasp is there twice: training and test would share it."""
+    """Raise `DatasetError` if a grasp occurs twice, as training and test would share it."""
     first: dict[bytes, str] = {}
     for table, counts in zip(grasps.table_of.tolist(), grasps.counts, strict=True):
         name, key = grasps.files[table].name, counts.tobytes()

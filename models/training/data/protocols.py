@@ -1,7 +1,7 @@
 """Evaluation protocols: the grasps for training, and the grasps that are judged.
 
-`cv`, `objects` and `objects-whole` also take lab tables, which are not published. Without any
-published table they take lab tables only.
+`cv`, `objects` and `objects-whole` also use lab tables, which are not published; without any
+published table they use only these.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ ABOUT: dict[EvalProtocol, str] = {
 UNKNOWN_OBJECTS = frozenset(
     ("juice", "aquarius", "green_gel", "tennis", "football", "milk", "metal_pen_case", "train")
 )
-"""Left out by the authors' notebooks: 485 of 2549 grasps. The paper's text counts 6 objects."""
+"""Objects that the authors' notebooks leave out of the training: 485 of 2549 grasps. The paper's
+text counts 6 objects."""
 FOLDS = 10
 DAYS = (
     ("A", WHOLE, (NEW_SESSION,)),
@@ -39,18 +40,18 @@ DAYS = (
     ("C", (NEW_SESSION, WHOLE[1]), WHOLE[:1]),
     ("C", (NEW_SESSION, WHOLE[0]), WHOLE[1:]),
 )
-"""Streams of `days`: name, tables of the training, judged tables."""
+"""Streams of the protocol `days`: name, training tables, judged tables."""
 DAYS_FOLDS = 4
 """Most folds of objects in `days`; with more, no session would have hundreds of grasps."""
 
 
 class TooFewGraspsError(ValueError):
-    """The data is too small for these folds: take fewer folds, or more data."""
+    """The data are too few for the folds: use fewer folds or more data."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Split:
-    """Grasps of a training, and those that it is judged by: row indices, ascending."""
+    """Grasps for a training, and grasps that test it: row indices, ascending."""
 
     name: str
     train: Ints
@@ -86,7 +87,7 @@ def grasp_of(grasps: Grasps) -> Ints:
 
 
 def fewest_grasps(grasps: Grasps) -> int:
-    """Return the number of grasps of the label that fewer have, each with all its readings once."""
+    """Return the number of grasps with the rarer label; all readings of a grasp count as one."""
     return _fewest(grasps, grasp_of(grasps))
 
 
@@ -99,8 +100,8 @@ def _fewest(grasps: Grasps, grasp: Ints) -> int:
 def folds_of(grasps: Grasps, folds: int, seed: int) -> Ints:
     """Return the fold of each row, shape (N,): stratified, shuffled with the seed.
 
-    All readings of a grasp have one fold. Raises `TooFewGraspsError` if a class has fewer grasps
-    than folds.
+    All readings of a grasp are in the same fold. Raises `TooFewGraspsError` if a class has fewer
+    grasps than folds.
     """
     from sklearn.model_selection import StratifiedGroupKFold, StratifiedKFold
 
@@ -159,7 +160,7 @@ def _unknown(grasps: Grasps, _seed: int, _folds: int) -> list[Split]:
 
 
 def _session(grasps: Grasps, seed: int, folds: int) -> list[Split]:
-    """Return splits that leave groups of objects out of both days, and test on the later."""
+    """Return splits that leave groups of objects out of both days, and test on the later day."""
     whole, later = _rows(grasps, *WHOLE), _rows(grasps, NEW_SESSION)
     fold_of = _object_folds(grasps, np.concatenate((whole, later)), folds, seed)
     of_whole, of_later = fold_of[: len(whole)], fold_of[len(whole) :]
@@ -174,7 +175,7 @@ def _session(grasps: Grasps, seed: int, folds: int) -> list[Split]:
 
 
 def _days(grasps: Grasps, seed: int, folds: int) -> list[Split]:
-    """Leave the same groups of objects out of all days: a split for each fold of each of `DAYS`."""
+    """Return a split for each fold of objects and each of `DAYS`; all days leave out the fold."""
     folds = min(folds, DAYS_FOLDS)
     every = _rows(grasps, *WHOLE, NEW_SESSION)
     fold_of = np.full(len(grasps), -1)

@@ -41,7 +41,7 @@ from graspd.models.training.estimators.graphs import (
 )
 
 PROBABILITY_FLOOR = 1e-3
-"""Distance of a forest's probability from 0 and 1, where its log-odds are infinite."""
+"""Smallest distance of a forest's probability from 0 and 1, so that log-odds are finite."""
 INTERRUPTED = "Training interrupted"
 """Start of scikit-learn's warning that Ctrl-C ended the training of a perceptron."""
 
@@ -51,12 +51,12 @@ class Boosting(HistGradientBoostingClassifier):  # type: ignore[misc]  # scikit-
 
     @property
     def trees(self) -> list[NDArray[np.void]]:
-        """Nodes of each tree, as scikit-learn keeps them."""
+        """Return the nodes of each tree, in scikit-learn's format."""
         return [predictor.nodes for (predictor,) in self._predictors]
 
     @property
     def base(self) -> float:
-        """Margin before the first tree."""
+        """Return the margin before the first tree."""
         return float(self._baseline_prediction.item())
 
 
@@ -156,7 +156,7 @@ def _model(config: ClassicalConfig, seed: int) -> ClassicalModel:
 
 
 def _mlp_margins(model: MLPClassifier, inputs: Floats32) -> Floats:
-    """Return the output before its logistic function, which would lose large margins."""
+    """Return the log-odds before the logistic function, in which large ones would saturate."""
     values = inputs.astype(np.float64)
     for weights, bias in zip(model.coefs_[:-1], model.intercepts_[:-1], strict=True):
         values = np.maximum(values @ weights + bias, 0.0)
@@ -168,9 +168,9 @@ def _mlp_margins(model: MLPClassifier, inputs: Floats32) -> Floats:
 def _one_thread() -> Iterator[None]:
     """Limit libraries to one thread, because sums over more threads round differently."""
     with threadpool_limits(1), warnings.catch_warnings():
-        # A perceptron's number of epochs is a setting here, not a failure to converge.
+        # The warning that a perceptron did not converge: its number of epochs is a setting here.
         warnings.filterwarnings("ignore", category=ConvergenceWarning)
-        # A perceptron takes Ctrl-C for the end of its training, and only warns.
+        # On Ctrl-C a perceptron ends its training and only warns.
         warnings.filterwarnings("error", message=INTERRUPTED, category=UserWarning)
         try:
             yield
@@ -190,7 +190,7 @@ def _svm(model: SVC, input_name: str) -> onnx.ModelProto:
     gamma = float(model.gamma)
     # -gamma * |x - v|**2 = 2 gamma x.v - gamma |v|**2 - gamma |x|**2
     constants = [
-        # The support vectors are readings, float32 as the input is: nothing is lost here.
+        # Support vectors are inputs of the training, which are float32, so nothing is lost.
         constant("vectors", vectors.T.astype(np.float32)),
         constant("two_gamma", np.array(2.0 * gamma)),
         constant("minus_gamma", np.array(-gamma)),
@@ -253,7 +253,7 @@ def _float32_below(thresholds: Floats) -> Floats32:
 
 
 def _forest(model: RandomForestClassifier, input_name: str) -> onnx.ModelProto:
-    """Return a graph whose trees add votes; shares of 1/199 would round differently."""
+    """Return a graph whose trees add whole votes. Shares such as 1/199 would round differently."""
     (trees,) = _from_sklearn(model, input_name).graph.node
     number = len(model.estimators_)
     (weights,) = (part for part in trees.attribute if part.name == "class_weights")
@@ -279,7 +279,7 @@ def _forest(model: RandomForestClassifier, input_name: str) -> onnx.ModelProto:
 
 
 def _perceptron(model: MLPClassifier, input_name: str) -> onnx.ModelProto:
-    """Return the graph up to the last logistic function, which loses large margins."""
+    """Return the graph up to the last logistic function, in which large margins would saturate."""
     graph = _from_sklearn(model, input_name).graph
     kinds = [node.op_type for node in graph.node]
     nodes = list(graph.node[: kinds.index("Sigmoid")])

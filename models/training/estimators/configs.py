@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 THREADS = 1
-"""Threads of a training. Sums over more threads round differently, and cores are busy."""
+"""Threads of one training. More would round sums differently, and other trainings use the cores."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +108,7 @@ class Augmentation:
 class DayShift:
     """Assumed difference of the features of two days after standardising.
 
-    Twice as much helps networks of a single training day more, but costs the others.
+    Twice these values help networks trained on a single day more, but harm the others.
     """
 
     gain: float = 0.3
@@ -126,8 +126,8 @@ DAY_SHIFT = DayShift()
 class Recipe:
     """Settings of one training by a one-cycle AdamW schedule.
 
-    Twenty epochs of one cycle stand for the paper's 300 epochs of Adam at a falling rate; the
-    cross-validated F1 stays within the paper's spread. A remainder of the last batch is left out.
+    Twenty epochs of one cycle replace the paper's 300 epochs of Adam at a falling rate; the
+    cross-validated F1 stays within the paper's spread. An incomplete last batch is left out.
     """
 
     epochs: int = 20
@@ -136,9 +136,9 @@ class Recipe:
     warm_up: float = 0.3
     """Fraction of the training in which the learning rate rises."""
     weight_decay: float = 0.5
-    """Decoupled, on convolution and dense weights only; stands for the paper's L2 term."""
+    """Decoupled weight decay of convolution and dense weights; replaces the paper's L2 term."""
     label_smoothing: float = 0.0
-    """Part of each target that is shared evenly among both classes."""
+    """Share of each target that is divided equally between both classes."""
     input_noise: float = 0.0
     """Standard deviation of the noise added to each input, in the input's own (z-score) units."""
     norm_momentum: float = 0.1
@@ -148,7 +148,7 @@ class Recipe:
 
 @dataclass(frozen=True, slots=True)
 class SessionRecipe(Recipe):
-    """Recipe for session features: each batch is varied as on other days."""
+    """Recipe for session features: each batch is shifted by a `DayShift`."""
 
     epochs: int = 40
     weight_decay: float = 1.0

@@ -29,7 +29,7 @@ FLOAT, DOUBLE = onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE
 
 
 class Fitted(Protocol):
-    """A trained system: what gives margins, and what is exported to ONNX."""
+    """A trained system, which gives margins and is exported to ONNX."""
 
     @property
     def parameters(self) -> int:
@@ -92,7 +92,7 @@ def standardised(model: onnx.ModelProto, mean: Floats32, scale: Floats32) -> onn
 
 
 def feed(graph: onnx.GraphProto, former: str, name: str) -> None:
-    """Let every node that takes `former` take `name` instead."""
+    """Replace the input `former` of every node by `name`."""
     for node in graph.node:
         node.input[:] = [name if given == former else given for given in node.input]
 
@@ -101,9 +101,9 @@ def from_torch(
     network: nn.Module, shape: Sequence[int], input_name: str, output_name: str
 ) -> onnx.ModelProto:
     """Return the graph of a network of inputs (N, *shape)."""
-    # Two inputs, because one would let the exporter take the batch for a constant.
+    # Two inputs: with one the exporter would treat the batch size as a constant.
     example = torch.zeros(2, *shape)
-    # On the exporter's warnings and deprecations no user can act.
+    # Users cannot act on the exporter's warnings and deprecations.
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)
@@ -166,7 +166,7 @@ def nodes_of(*texts: str) -> list[onnx.NodeProto]:
     """Return a node for each text, such as `y = Mul (x, factor)`."""
     nodes = [parse_node(text) for text in texts]
     for node in nodes:
-        node.ClearField("domain")  # the parser writes "", which stands for itself
+        node.ClearField("domain")  # the parser writes "", the default
     return nodes
 
 

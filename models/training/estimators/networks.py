@@ -1,4 +1,4 @@
-"""Networks of PyTorch: made from a configuration, trained, and folded for a model file."""
+"""PyTorch networks: built from a configuration, trained, and folded for a model file."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ POOL = 2
 NORM_EPSILON = 1e-3
 """Keras' default: the published networks were trained with it."""
 INFERENCE_BATCH = 512
-"""Most inputs of a forward pass; it limits memory and changes nothing else."""
+"""Most inputs of a forward pass; it only limits memory."""
 KERAS_ADAM_EPSILON = 1e-8
 """Epsilon of Adam in Keras 2.0.8, which trained the published networks."""
 
@@ -73,7 +73,7 @@ class Beside(nn.Module):
         self.first = first
 
     def forward(self, features: torch.Tensor) -> torch.Tensor:
-        """Features (N, M) to (N, seen + M - first)."""
+        """Return features (N, M) as (N, seen + M - first); `seen`: outputs of the layers."""
         seen = self.look(features[:, : self.first])
         return torch.cat((seen, features[:, self.first :]), dim=1)
 
@@ -130,7 +130,7 @@ def train_network(
     """Train a network on inputs (N, *shape) and labels (N,); return it in evaluation mode.
 
     The same arguments give the same weights on the same machine. Each epoch sees the grasps once,
-    shuffled. Raises `ValueError` for less than two grasps.
+    shuffled. Raises `ValueError` for fewer than two grasps.
     """
     if len(inputs) < 2:
         raise ValueError(f"cannot train on {len(inputs)} grasps")
@@ -257,14 +257,14 @@ def _fit(
 def _batches(grasps: int, recipe: AnyRecipe) -> Sequence[slice]:
     """Return the slices of an epoch's shuffled order, one per batch."""
     batch = min(recipe.batch, grasps)
-    # A batch norm cannot be trained on a single grasp; Keras takes any other remainder.
+    # A batch norm cannot be trained on a single grasp. Keras uses any larger remainder.
     least = batch if isinstance(recipe, Recipe) else 2
     starts = range(0, grasps, batch)
     return [slice(start, start + batch) for start in starts if grasps - start >= least]
 
 
 def _look(config: NetworkConfig, shape: tuple[int, ...]) -> list[nn.Module]:
-    """Return the layers that turn an input into the values before the hidden layer."""
+    """Return the layers from the input to the hidden layer's inputs."""
     if len(shape) == 3:
         return [ChannelsFirst(), *_convolutions(config, shape[2])]
     (features,) = shape
@@ -309,7 +309,7 @@ def _folded(network: nn.Sequential) -> list[nn.Module]:
 
 
 def _split(network: nn.Sequential) -> tuple[list[nn.Module], nn.Linear]:
-    """Return a copy for inference: the folded layers, and the last one."""
+    """Return a copy for inference as two parts: the folded layers, and the last layer."""
     *layers, last = _folded(copy.deepcopy(network).eval())
     if not isinstance(last, nn.Linear):
         raise TypeError(f"a network ends in a linear layer, not {type(last).__name__}")

@@ -1,4 +1,4 @@
-"""Study of broken electrodes: their cost unnoticed, and after repair."""
+"""Study of broken electrodes: their cost in F1, unnoticed and after repair."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from graspd.models.training.fitting.trained import Trained, train
 from graspd.models.training.systems.registry import System
 
 FOLDS, JUDGED_FOLDS = 10, 3
-"""Number of stratified folds, and of those judged; three show a difference of a few points."""
+"""Number of stratified folds, and of folds judged; three show a difference of a few points."""
 NUMBERS = (1, 2, 4, 8, 12)
 LOOKED_FOR_MAX = BROKEN_MAX + 1
-"""Most broken electrodes that are searched: one more than the daemon repairs in a reading."""
+"""Most broken electrodes that a search may find: one more than the daemon repairs."""
 
 Breakage = Callable[[Numbers, np.random.Generator], Numbers]
 KINDS: dict[str, Breakage] = {
@@ -64,9 +64,9 @@ def broken_study(system: System, grasps: Grasps, seed: int) -> dict[str, Any]:
 
 
 def left_out(grasps: Grasps, seed: int) -> list[Bools]:
-    """Return for each training True for its held-out grasps, shape (N,).
+    """Return for each training a mask of its held-out grasps, shape (N,).
 
-    Raises `TooFewGraspsError` for less than two grasps of a label.
+    Raises `TooFewGraspsError` for fewer than two grasps of a label.
     """
     folds = min(FOLDS, max(2, fewest_grasps(grasps)))
     fold_of = folds_of(grasps, folds, seed)
@@ -74,7 +74,7 @@ def left_out(grasps: Grasps, seed: int) -> list[Bools]:
 
 
 class _Fold:
-    """A system trained without some grasps, and those grasps."""
+    """A system trained without some grasps, and the held-out grasps."""
 
     def __init__(self, system: System, grasps: Grasps, left_out: Bools, seed: int) -> None:
         rest = grasps.rows(np.flatnonzero(~left_out).astype(np.int64))
@@ -113,7 +113,7 @@ def _break(
 ) -> dict[str, Any]:
     rows = []
     for fold in folds:
-        # The places with the smallest of random numbers, `number` in each reading.
+        # The `number` electrodes of each reading with the smallest random values are broken.
         order = random.random((len(fold.counts), fold.counts[0].size)).argsort(axis=1)
         where: Bools = (order < number).reshape(fold.counts.shape)
         counts = np.where(where, KINDS[reads](fold.counts, random), fold.counts)

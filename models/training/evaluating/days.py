@@ -1,4 +1,4 @@
-"""Grasps of another day, judged one after the other as the daemon does, without labels."""
+"""Judge grasps of another day one after the other, without labels, as the daemon does."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def verdicts(
     refused: Bools | None = None,
     ages: Ints | None = None,
 ) -> pd.DataFrame:
-    """Return the verdicts of a variant on these rows of grasps, as `frame.judged` has them.
+    """Return the verdicts of a variant on these rows of grasps, with columns of `frame.judged`.
 
     `refused` None: not known; `ages` None: there is no running session.
     """
@@ -44,8 +44,8 @@ def verdicts(
 def judged_days(trained: Trained, grasps: Grasps, test: Ints, seed: int) -> Iterator[pd.DataFrame]:
     """Judge the rows `test` of grasps with a trained system; each table is a new session.
 
-    A session system judges each table in random order, and again object by object. Refused grasps
-    have margins too.
+    A session system judges each table in random order, then object by object. Refused grasps also
+    have margins.
     """
     counts, table_of = grasps.counts[test], grasps.table_of[test]
     if not isinstance(trained.system.input, SessionFeatures):
@@ -71,7 +71,7 @@ def judged_days(trained: Trained, grasps: Grasps, test: Ints, seed: int) -> Iter
 
 
 def by_object(random: np.random.Generator, rows: Ints, objects: NDArray[np.str_]) -> Ints:
-    """Return rows (N,) sorted by their `objects` (N,), which come in random order.
+    """Return rows (N,) grouped by their `objects` (N,), with the objects in random order.
 
     The rows of each object stay in the order given.
     """
@@ -80,7 +80,7 @@ def by_object(random: np.random.Generator, rows: Ints, objects: NDArray[np.str_]
 
 
 class Day:
-    """The grasps of one day, judged in turn; a session system begins a session with the first."""
+    """Judges the grasps of one day in turn; a session system starts with an empty session."""
 
     def __init__(self, trained: Trained) -> None:
         self.network = TrainedNetwork(trained)
@@ -89,7 +89,7 @@ class Day:
 
     @property
     def grasps(self) -> int:
-        """Grasps that the session has taken in; 0 without one."""
+        """Number of grasps that the session has taken in; 0 without a session."""
         return 0 if self.judge_of.session is None else self.judge_of.session.grasps
 
     def judge(self, counts: NDArray[np.uint16]) -> tuple[float, bool]:
@@ -104,7 +104,7 @@ class Day:
 
 
 class TrainedNetwork:
-    """A trained system in place of its model file, for a `GraspJudge`."""
+    """Adapter that lets a `GraspJudge` use a trained system without a model file."""
 
     def __init__(self, trained: Trained) -> None:
         self._fitted = trained.fitted

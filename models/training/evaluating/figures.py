@@ -1,4 +1,4 @@
-"""Figures of a system in a protocol, grouped from its rows, which are kept as Parquet."""
+"""Figures of a system in a protocol, computed from rows that are kept as Parquet."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ AGES = (0, 5, 10, 20, 50, 100, 300)
 """Limits of the groups of grasps by the age of a running session, grasps."""
 LIBRARIES = ("numpy", "scikit-learn", "torch")
 STREAMS = [f"{day} {table}" for day, _, judged in DAYS for table in judged]
-"""Names of the streams of `days`: `A`, `B` or `C`, and the table that is judged."""
+"""Names of the streams of `days`: `A`, `B` or `C`, and the judged table."""
 GROUPS = {
     **{name: [name] for name in STREAMS},
     "A and C": [name for name in STREAMS if not name.startswith("B")],
@@ -72,15 +72,15 @@ class Figures:
 
     @property
     def headline(self) -> str:
-        """The variant whose figures are quoted for the system.
+        """Variant whose figures are quoted for the system.
 
-        In a later session it is the one of 50 unlabelled grasps.
+        In the protocol `session` it is the one with 50 unlabelled grasps.
         """
         return Variant.N50 if Variant.N50 in self.variants else self.variants[0]
 
     @property
     def trainings(self) -> pd.DataFrame:
-        """A row for each training."""
+        """Table with a row for each training."""
         return self.rows.drop_duplicates(["seed", "fold"])
 
     @property
@@ -95,12 +95,12 @@ class Figures:
 
     @property
     def test_grasps(self) -> float:
-        """Number of grasps that a training is judged by, mean over the trainings."""
+        """Number of grasps that test a training, mean over the trainings."""
         return len(self.of_variant()) / len(self.trainings)
 
     @property
     def parameters(self) -> int:
-        """Numbers that a trained system consists of, mean over the trainings."""
+        """Number of parameters of a trained system, mean over the trainings."""
         return round(float(self.trainings["parameters"].mean()))
 
     def of_variant(self, variant: str | None = None) -> pd.DataFrame:
@@ -116,14 +116,14 @@ class Figures:
         return metrics.over_seeds(self.folds_of(figure, variant).to_numpy())
 
     def f1_interval(self) -> tuple[float, float]:
-        """Return the 95 % interval of F1 of all grasps together, for other objects of the kind."""
+        """Return the 95 % interval of F1 over all grasps, as if other such objects were drawn."""
         rows = self.of_variant()
         slip, slipped = rows["margin"] > 0.0, rows["slipped"]
         of = slip.astype(int) + slipped
         return metrics.interval(2 * (slip & slipped), of, rows["object"])
 
     def accuracy_at(self, coverage: float) -> float:
-        """Return the accuracy of this share of the grasps, the most confident ones."""
+        """Return the accuracy of the most confident verdicts, a share `coverage` of all grasps."""
         rows = self.of_variant()
         return metrics.accuracy_at(rows["probability"], rows["slipped"], coverage)
 
@@ -137,19 +137,19 @@ def with_probability(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def temperature(rows: pd.DataFrame) -> float:
-    """Return the temperature of all margins together."""
+    """Return the temperature fitted to all margins together."""
     return metrics.fit_temperature(rows["margin"].to_numpy(), rows["slipped"].to_numpy())
 
 
 def right(rows: pd.DataFrame) -> pd.Series:
-    """Return whether each verdict is right."""
+    """Return True for each right verdict."""
     return (rows["margin"] > 0.0) == rows["slipped"]
 
 
 def by_age(rows: pd.DataFrame) -> dict[int, pd.DataFrame]:
     """Return the rows of a running variant by the age of its session, the youngest first.
 
-    A key is the lowest age of its rows; they end below the next one of `AGES`.
+    A key is the lowest age of its rows, one of `AGES`; the next one is their end.
     """
     group_of = np.searchsorted(AGES, rows["age"].to_numpy(np.int64), side="right") - 1
     return {AGES[group]: part for group, part in rows.groupby(group_of)}
@@ -158,9 +158,9 @@ def by_age(rows: pd.DataFrame) -> dict[int, pd.DataFrame]:
 def by_day(rows: pd.DataFrame) -> dict[str, dict[str, Any]]:
     """Return the figures of a variant of `days` by group of streams.
 
-    `every`: of all grasps, also those that the daemon would refuse; `judged`: of the others;
-    `coverage`: fraction of the others; `refused_slipped`: fraction of slips among the refused,
-    None without any.
+    `every`: figures of all grasps, also of those that the daemon would refuse; `judged`: of the
+    rest; `coverage`: fraction of the rest; `refused_slipped`: fraction of slips among the refused;
+    None: no refused.
     """
     streams = rows["fold_name"].str[0] + " " + rows["table"]
     made = {}
@@ -185,10 +185,10 @@ def write(figures: Figures, folder: Path) -> None:
 
 
 def read(folder: Path, data: str, digests: Mapping[str, str]) -> list[Figures]:
-    """Return the figures of the folder's files that are of this data, by system and protocol.
+    """Return the figures in the folder's files that belong to `data`, by system and protocol.
 
-    `data`: digest of the grasps; `digests`: those of the systems by name, in their order. A file
-    that is of another configuration or cannot be read is left out, with a warning.
+    `data`: digest of the grasps. `digests`: digest of each system by name, in order. A file of
+    another configuration, or one that cannot be read, is left out with a warning.
     """
     found = []
     for path in sorted(folder.glob("*.parquet")):
@@ -206,7 +206,7 @@ def read(folder: Path, data: str, digests: Mapping[str, str]) -> list[Figures]:
 
 
 def made_with(libraries: Sequence[str] = LIBRARIES) -> dict[str, str]:
-    """Machine, Python and versions of libraries that decide the last digits."""
+    """Return machine, Python and versions of libraries, on which the last digits depend."""
     versions = {name: importlib.metadata.version(name) for name in libraries}
     machine = f"{platform.machine()}, {os.cpu_count()} cores"
     return {"machine": machine, "python": platform.python_version(), **versions}

@@ -1,4 +1,4 @@
-"""Write result files that are complete or absent, whenever the program ends; tables in them."""
+"""Write result files, which are complete or absent whenever the program ends, and their tables."""
 
 from __future__ import annotations
 

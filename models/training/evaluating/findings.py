@@ -28,8 +28,8 @@ FINDINGS = (
     "{svm-session/session}, {svm-session/session/difference} to `cnn1`. In `days`, from nothing, "
     "`small-session` has {small-session/days}.",
 )
-"""Sentences on the tables. A figure is `SYSTEM/PROTOCOL`, F1, or the part of it that comes after; a
-finding without all of its figures is left out. Read the words again when the figures change."""
+"""Sentences on the tables. A placeholder is `SYSTEM/PROTOCOL`, its F1, or a part named after it. A
+finding that lacks a figure is left out. Check the sentences when the figures change."""
 HOW_SURE = (
     "How sure: one hand, 41 objects, three tables. Folds share grasps, and the standard errors of "
     "section 5 are corrected for that. A row of one seed does not show what another seed changes. "
@@ -61,4 +61,4 @@ SEALED = (
     "    git clone https://github.com/3dperceptionlab/biotacsp-stability-set-v2\n"
     "    graspd replay FILE --model MODEL [--outcomes [--max-slip-when-stable 0.05]]",
 )  # fmt: skip
-"""The sealed day: text, titles, rows, commands."""
+"""Section on the sealed test day: text, titles, rows, commands."""

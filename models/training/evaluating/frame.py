@@ -29,13 +29,13 @@ from graspd.models.training.fitting.trained import Trained, train
 from graspd.models.training.systems.registry import SessionFeatures, System, digest
 
 FORMAT = 2
-"""Version of kept verdicts; raise it if a training judges otherwise, or the columns change."""
+"""Version of kept verdicts. Increase it if trainings give other verdicts or columns."""
 _ONE_AT_A_TIME = threading.Lock()
-"""Lock of torch's random state and number of threads, which the process shares."""
+"""Lock for torch's random state and number of threads, which all threads share."""
 
 
 class LostWorkerError(Exception):
-    """A process or a cluster's worker is gone. Finished trainings are kept; try again."""
+    """A process or a cluster's worker was lost. Finished trainings are kept; try again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,13 +75,13 @@ def judged(job: Job, grasps: Grasps) -> pd.DataFrame:
     that its running session had before. The training has `fold_name`, `train_grasps`, `parameters`
     (numbers that the trained system consists of) and `seconds` (with judging).
 
-    Depends on the arguments alone, whatever runs beside it. Raises `TooFewGraspsError` if the data
-    do not have that split, `ValueError` if the system cannot learn from it.
+    The result depends on the arguments alone. Raises `TooFewGraspsError` if the data
+    lack that split, `ValueError` if the system cannot learn from it.
     """
     split = splits(job.protocol, grasps, job.seed, job.folds)[job.fold]
     seed = fold_seed(job.seed, job.fold)
     grasps = grasps.of_fingers(job.system.fingers)
-    # A forest would otherwise send its trees back to the cluster that this job came from.
+    # A forest would otherwise send its trees to the cluster that runs this job.
     with _ONE_AT_A_TIME, joblib.parallel_config("sequential"):
         started_s = time.perf_counter()
         trained = train(job.system, grasps.rows(split.train), seed)
@@ -103,7 +103,7 @@ def judged(job: Job, grasps: Grasps) -> pd.DataFrame:
 def _judged_at_once(
     trained: Trained, grasps: Grasps, split: Split, seed: int
 ) -> Iterator[pd.DataFrame]:
-    """Judge the test grasps of a split; only those of a later session in several variants."""
+    """Judge the test grasps of a split, in several variants if they are of a later session."""
     test, kind, standards = split.test, trained.system.input, trained.standards
     if split.calibration is None or standards is None or not isinstance(kind, SessionFeatures):
         variant = Variant.NONE if standards is None else Variant.TRAINING
@@ -120,16 +120,15 @@ def _judged_at_once(
 def evaluated(
     wanted: Sequence[Job], grasps: Grasps, folder: Path
 ) -> Iterator[tuple[Job, pd.DataFrame]]:
-    """Yield each job with its rows: first those that are kept, then the others as they end.
+    """Yield each job with its rows: first jobs with kept results, then the others as they end.
 
     The rows are those of `judged`, with the columns `system`, `protocol`, `seed` and `fold`, the
     digests of the system (`digest`) and of all grasps (`data`), and `object`, `table` and `slipped`
     of the grasp.
 
-    Each result is kept in `folder` before it is yielded, so an interrupted run can continue; what
-    cannot be read there is judged again. On a cluster all computers share that folder.
-
-    Raises what `judged` raises, `LostWorkerError`, and `OSError` if the folder cannot be used.
+    Each result is kept in `folder` before it is yielded, so an interrupted run can continue.
+    Unreadable results are judged again. On a cluster all computers must share that folder.
+    Raises the errors of `judged`, `LostWorkerError`, and `OSError` if the folder cannot be used.
     """
     folder.mkdir(parents=True, exist_ok=True)
     kept = joblib.Memory(folder, verbose=0).cache(_judged, ignore=["job", "grasps"])
@@ -139,12 +138,12 @@ def evaluated(
             yield job, _described(job, kept(job.causes(data), job, grasps), grasps, data)
         else:
             missing.append(job)
-    # All at once, so that computers that join later get their share.
+    # All are submitted at once, so that computers that join later get a share.
     parallel = joblib.Parallel(return_as="generator_unordered", pre_dispatch="all", batch_size=1)
     work = (joblib.delayed(_with_job)(kept, job.causes(data), job, grasps) for job in missing)
-    with closing(parallel(work)) as outcomes:  # stops what still runs
+    with closing(parallel(work)) as outcomes:  # stops running trainings
         for outcome in outcomes:
-            if isinstance(outcome, BaseException):  # what joblib makes of a cancelled task
+            if isinstance(outcome, BaseException):  # joblib's result of a cancelled task
                 raise outcome
             job, rows = outcome
             yield job, _described(job, rows, grasps, data)
@@ -165,12 +164,12 @@ def processes(number: int) -> Iterator[None]:
 
 
 def _leave_ctrl_c() -> None:
-    # A terminal sends Ctrl-C to the workers, too; it is the first process that ends them.
+    # A terminal sends Ctrl-C also to the workers, which must leave it to the first process.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _judged(causes: tuple[object, ...], job: Job, grasps: Grasps) -> pd.DataFrame:
-    """Return the verdicts of a job; `causes` is what they are kept by."""
+    """Return the verdicts of a job; `causes` is the key under which they are kept."""
     return judged(job, grasps)
 
 
@@ -181,7 +180,7 @@ def _with_job(
 
 
 def _described(job: Job, rows: pd.DataFrame, grasps: Grasps, data: str) -> pd.DataFrame:
-    """Return the rows of a job with what was judged; a name is not kept with the verdicts."""
+    """Return the rows of a job with columns on job and grasp, which are not kept with them."""
     of_grasp = rows["grasp"].to_numpy()
     names = np.array([file.name for file in grasps.files])
     return rows.assign(

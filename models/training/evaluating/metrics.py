@@ -33,7 +33,7 @@ CURVE_STEPS = 50
 FEWEST_JUDGED = 50
 """Fewest verdicts that show how often they are right."""
 DRAWS = 2000
-"""Draws of objects that make an interval; another thousand moves it by a tenth of a point."""
+"""Number of draws of objects for an interval; another thousand moves it by a tenth of a point."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,8 +43,8 @@ class Spread:
     mean: float
     """Mean over the seeds of each seed's fold mean."""
     std: float
-    """Population standard deviation over the folds, mean of the seeds; over the seeds where a seed
-    has one fold only."""
+    """Population standard deviation over the folds, averaged over the seeds; with a single fold,
+    that over the seeds."""
     error: float | None
     """Standard error of the mean over the seeds; None for one seed."""
     seeds: int
@@ -75,7 +75,7 @@ def score(margins: Floats, slipped: Bools, probability: Floats) -> dict[str, flo
 
 
 def _ece(probability: Floats, slipped: Bools) -> float:
-    """Expected calibration error of slip probabilities (N,)."""
+    """Return the expected calibration error of slip probabilities (N,)."""
     confidence = np.maximum(probability, 1.0 - probability)
     correct = (probability > 0.5) == slipped
     bins = np.minimum((confidence * ECE_BINS).astype(np.int64), ECE_BINS - 1)
@@ -84,7 +84,7 @@ def _ece(probability: Floats, slipped: Bools) -> float:
 
 
 def p_slip(margins: Floats, temperature: float) -> Floats:
-    """Return sigmoid(margin / temperature) of margins (N,): as sure of slip as of stable."""
+    """Return sigmoid(margin / temperature) of margins (N,)."""
     small = np.exp(-np.abs(margins / temperature))
     probability: Floats = np.where(margins >= 0.0, 1.0, small) / (1.0 + small)
     return probability
@@ -96,16 +96,17 @@ def fit_temperature(margins: Floats, slipped: Bools) -> float:
     low, high = np.log(TEMPERATURE_RANGE)
     for _ in range(HALVINGS):
         middle = (low + high) / 2.0
-        # The likelihood is concave in 1/T; its slope there says on which side of T the peak is.
+        # The likelihood is concave in 1/T, so its slope shows on which side the maximum is.
         slope = np.mean((slipped - p_slip(margins, np.exp(middle))) * margins)
         low, high = (low, middle) if slope > 0.0 else (middle, high)
     return float(np.exp((low + high) / 2.0))
 
 
 def cross_fitted(rows: pd.DataFrame) -> pd.Series:
-    """Return the slip probability of each row, of one seed and variant.
+    """Return the slip probability of each row; `rows` are of one seed and variant.
 
-    Each fold is calibrated by the temperature of the other folds, a single fold object by object.
+    Each fold is calibrated by the other folds' temperature; in a single fold, each object by
+    others.
     """
     group_of = rows["fold"] if rows["fold"].nunique() > 1 else rows["object"]
     probability = pd.Series(np.nan, rows.index)
@@ -121,7 +122,7 @@ def cross_fitted(rows: pd.DataFrame) -> pd.Series:
 def over_seeds(figures: Floats) -> Spread:
     """Return mean and spread of figures (seeds, folds) without NaN; only NaN gives NaN."""
     seeds, folds = figures.shape
-    if np.isnan(figures).all():  # the mean of nothing is a warning
+    if np.isnan(figures).all():  # the mean of no values would warn
         return Spread(math.nan, math.nan, None, seeds, folds)
     means = np.nanmean(figures, axis=1)
     std = np.nanstd(figures, axis=1).mean() if folds > 1 else means.std()
@@ -134,8 +135,8 @@ def paired_difference(differences: Floats, test_to_train: float) -> tuple[float,
 
     Trainings share most of their grasps, so their errors are not independent: the variance of the
     mean is `(1 / J + test_to_train)` times that of the J differences (Nadeau & Bengio 2003,
-    Inference for the Generalization Error). `test_to_train` is the ratio of their grasps; 0 where
-    the trainings differ by their seed alone. A single split has no error.
+    Inference for the Generalization Error). `test_to_train` is the ratio of test to training
+    grasps; 0 if the trainings differ only by their seed. A single split has no error.
     """
     mean = float(differences.mean())
     if len(differences) < 2:
@@ -145,9 +146,9 @@ def paired_difference(differences: Floats, test_to_train: float) -> tuple[float,
 
 
 def interval(some: pd.Series, of: pd.Series, objects: pd.Series) -> tuple[float, float]:
-    """Return the 95 % interval of `some` by `of`, sums over grasps, for other objects of the kind.
+    """Return the 95 % interval of sum(`some`) / sum(`of`), as if other such objects were drawn.
 
-    Objects are drawn with replacement, each with all its grasps: those of one object are alike.
+    Objects are drawn with replacement with all their grasps, as grasps of an object are alike.
     """
     sums = pd.DataFrame({"some": some, "of": of}).groupby(objects).sum().to_numpy()
     drawn = np.random.default_rng(0).integers(len(sums), size=(DRAWS, len(sums)))
@@ -158,14 +159,14 @@ def interval(some: pd.Series, of: pd.Series, objects: pd.Series) -> tuple[float,
 
 
 def confusion(rows: pd.DataFrame) -> Ints:
-    """Return the number of grasps (2, 2): rows stable, slip as it was; columns as judged."""
+    """Return numbers of grasps, shape (2, 2): actual stable, slip by judged stable, slip."""
     counts: Ints = np.zeros((2, 2), np.int64)
     np.add.at(counts, (rows["slipped"].astype(int), (rows["margin"] > 0.0).astype(int)), 1)
     return counts
 
 
 def verdict_figures(rows: pd.DataFrame) -> dict[str, float | None]:
-    """Return what verdicts came to, as fractions, slip positive; None: of no such grasp."""
+    """Return the scores of verdicts, as fractions, slip positive; None: no such grasp."""
     (held, alarms), (missed, found) = confusion(rows).tolist()
     return {
         "grasps": len(rows),
@@ -181,9 +182,9 @@ def _share(some: int, of: int) -> float | None:
 
 
 def by_confidence(probability: pd.Series, slipped: pd.Series) -> pd.DataFrame:
-    """Return the `accuracy` and the `coverage` of all verdicts from each `confidence` on, falling.
+    """Return `accuracy` and `coverage` of the verdicts with at least each `confidence`, falling.
 
-    Verdicts of equal confidence stay together.
+    Verdicts of equal confidence count together.
     """
     confidence = np.maximum(probability, 1.0 - probability)
     right = (probability > 0.5) == slipped
@@ -209,7 +210,7 @@ def coverage_curve(
 
 
 def accuracy_at(probability: pd.Series, slipped: pd.Series, coverage: float) -> float:
-    """Return the accuracy of this share of the grasps, the most confident ones; at least one."""
+    """Return the accuracy of the most confident verdicts: the share `coverage`, at least one."""
     uncertainty = -np.maximum(probability, 1.0 - probability)
     right = ((probability > 0.5) == slipped).iloc[uncertainty.argsort(kind="stable")]
     return float(right.iloc[: max(1, round(coverage * len(right)))].mean())

@@ -41,8 +41,7 @@ def results_table(
 ) -> str:
     """Return the whole document as Markdown; what was not run is `-`.
 
-    `grasps`, `command`, `made_with`: what was judged, and the command line and versions by name
-    that did it.
+    `grasps`: judged grasps. `command`, `made_with`: command line, and versions by library.
     """
     by_group: ByGroup = {(one.system, one.protocol): one for one in several}
     sections = (
@@ -78,7 +77,7 @@ def _findings(by_group: ByGroup) -> Iterator[str]:
     figures = _figures(by_group)
     lines = []
     for finding in FINDINGS:
-        with suppress(KeyError):  # of what was not run
+        with suppress(KeyError):  # a figure that was not computed
             lines.append(f"- {finding.format_map(figures)}")
     if lines:
         yield "## Findings"
@@ -116,7 +115,7 @@ def _paper(by_group: ByGroup) -> Iterator[str]:
 
 
 def _published(system: System, published: PaperFigure, by_group: ByGroup) -> Iterator[Row]:
-    """A row for each figure that the paper gives."""
+    """Yield a row for each figure that the paper gives."""
     one = by_group.get((system.name, published.protocol))
     for figure in FIGURES:
         paper = getattr(published, figure)
@@ -251,7 +250,8 @@ def _differences(by_group: ByGroup) -> Iterator[str]:
 
 def difference(ours: Figures, theirs: Figures) -> tuple[float, float | None] | None:
     """Return our mean F1 less theirs on the splits that both have judged, and its standard error.
-    None: no split is the same, for another number of folds, say."""
+
+    None: they share no split, for example because of another number of folds."""
     if ours.folds != theirs.folds:
         return None
     gaps = (ours.folds_of("f1") - theirs.folds_of("f1")).stack().dropna()

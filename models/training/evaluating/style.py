@@ -12,9 +12,9 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 
 INK, PAPER, GRID, QUIET = "#1f2328", "#ffffff", "#d8dee4", "#6e7781"
-"""Text and axes, background, grid lines, what stands back."""
+"""Colours of text and axes, background, grid lines, and secondary text."""
 BLUE, NAVY, ORANGE, OLIVE = "#1f6f8b", "#123f50", "#c65d21", "#9a8f2f"
-"""graspd, graspd under a risk, others, graspd without outcomes."""
+"""Colours of graspd, graspd under a risk, others, and graspd without outcomes."""
 DARK: Final = {
     INK: "#e6edf3",
     PAPER: "#0d1117",
@@ -25,9 +25,9 @@ DARK: Final = {
     ORANGE: "#f0883e",
     OLIVE: "#d0c24f",
 }
-"""Colours where the reader prefers dark pages, by the light ones."""
+"""Colours for readers who prefer dark pages, by the light colour that each replaces."""
 QUICK: Final = "made with --quick: the figures mean nothing"
-"""Mark on all that `--quick` makes."""
+"""Mark on all results of `--quick`."""
 _COLOUR: Final = re.compile(r"(fill|stroke): (#[0-9a-f]{6})(?:; )?")
 _STYLE: Final = re.compile(r'style="([^"]*)"')
 
@@ -81,7 +81,7 @@ def to_svg(figure: Figure, title: str, figures: Sequence[str]) -> str:
 
 
 def _with_classes(found: re.Match[str]) -> str:
-    """Take the palette's colours out of a `style`, and name them as classes."""
+    """Replace the palette's colours in a `style` attribute by classes."""
     classes = [
         f"{kind[0]}{colour[1:]}" for kind, colour in _COLOUR.findall(found[1]) if colour in DARK
     ]

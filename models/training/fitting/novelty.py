@@ -1,4 +1,4 @@
-"""Novelty: describe the training counts, and measure how much other data is unlike them."""
+"""Novelty: describe the training counts, and measure which share of other data is unlike them."""
 
 from __future__ import annotations
 
@@ -18,10 +18,8 @@ Held-out grasps of the same session pass. It refuses 97 % of the later session p
 network judges wrongly.
 """
 SESSION_MARGIN_COUNTS = 500
-"""Margin of a session model, counts: the mapping follows drift, and is rough in a young session.
-
-It refuses 6 % of palm_45.
-"""
+"""Margin of a session model, counts. Its mapping follows drift, but is rough in a young session. It
+refuses 6 % of palm_45."""
 DISTANCE_MAX = 2.5
 """Largest root-mean-square whitened deviation that still passes as seen.
 
@@ -65,7 +63,8 @@ def seen_counts(counts: Numbers, margin: int = MARGIN_COUNTS) -> SeenCounts:
 
 
 def held_out_never_seen(counts: Numbers, group_of: Numbers, margin: int = MARGIN_COUNTS) -> float:
-    """Return the refused fraction of counts (N, fingers, 24), each compared with other groups.
+    """Return the refused fraction of counts (N, fingers, 24), each compared with other groups'
+    counts.
 
     `group_of`: fold or object of each, shape (N,).
     """
@@ -77,9 +76,9 @@ def held_out_never_seen(counts: Numbers, group_of: Numbers, margin: int = MARGIN
 
 
 def made_up_never_seen(counts: Numbers, seen: SeenCounts, seed: int) -> dict[str, float]:
-    """Return the refused fraction of made-up readings, by the way they are made up.
+    """Return the refused fraction of synthetic readings, by the way they are made.
 
-    `counts`: real ones, shape (N, fingers, 24). `seen`: their description.
+    `counts`: real counts, shape (N, fingers, 24). `seen`: their description.
     """
     random = np.random.default_rng(seed)
     shape = (RANDOM_READINGS, *counts.shape[1:])

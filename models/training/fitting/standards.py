@@ -13,33 +13,33 @@ from graspd.models.training.arrays import Floats, Floats32, Ints
 PRIOR_GRASPS = 1.0
 """Weight of the training's statistics in a new session, grasps."""
 CALIBRATED_FROM = 20.0
-"""Grasps from which a session counts as calibrated; more gain at most two points."""
+"""Number of grasps from which on a session counts as calibrated; more gain at most two points."""
 
 
 class Variant(StrEnum):
-    """Grasps whose statistics standardise the features of a judged grasp."""
+    """Grasps whose mean and spread standardise the features of a judged grasp."""
 
     NONE = "none"
-    """No grasps of its session: those of the training, or no session model at all."""
+    """All training grasps, but not the judged session; also used without a session model."""
     N5 = "n5"
-    """Five unlabelled grasps of its session, and of other objects, drawn at random."""
+    """Five unlabelled grasps of the judged session, of other objects, drawn at random."""
     N10 = "n10"
     N20 = "n20"
     N50 = "n50"
     ALL = "all"
-    """All grasps of its session that are of other objects."""
+    """All grasps of the judged session that are of other objects."""
     RUNNING = "running"
-    """A session from nothing: the grasps before it, objects mixed."""
+    """The grasps judged before it in a session that starts empty; objects are mixed."""
     RUNNING_SORTED = "running-sorted"
-    """The same, one object after the other."""
+    """As `RUNNING`, but one object after the other."""
     TRAINING = "training"
-    """The training grasps of its own table."""
+    """The training grasps of the judged grasp's own table."""
 
 
 SESSION_VARIANTS = tuple(variant for variant in Variant if variant != Variant.TRAINING)
 """Variants of the protocol `session`."""
 DRAWN = {Variant.N5: 5, Variant.N10: 10, Variant.N20: 20, Variant.N50: 50}
-"""Number of grasps that are drawn."""
+"""Number of grasps that are drawn, by variant."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,7 +52,7 @@ class Standards:
 
     @classmethod
     def of(cls, features: Floats) -> Standards:
-        """Return mean and spread of features (N, M); a constant one has spread 1."""
+        """Return mean and spread of features (N, M); a constant feature has spread 1."""
         return cls(features.mean(axis=0), _positive(features.std(axis=0)))
 
     def apply(self, features: Floats, clip: float) -> Floats32:
@@ -63,12 +63,12 @@ class Standards:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrainingStandards:
-    """Statistics of the training rows of each table; a table stands for a session."""
+    """Mean and spread of the training rows of each table; each table counts as a session."""
 
     tables: dict[int, Standards]
-    """Standards by index of the table."""
+    """Standards of each table by its index."""
     prior: Standards
-    """Start of a new session: mean of all rows, spread within a table."""
+    """Standards at the start of a new session: mean of all rows, spread within a table."""
 
     @classmethod
     def of(cls, features: Floats, table_of: Ints) -> TrainingStandards:
@@ -96,10 +96,10 @@ class TrainingStandards:
 def later_session(
     features: Floats, test: Ints, pool: Ints, training: TrainingStandards, seed: int
 ) -> tuple[dict[Variant, Standards], dict[Variant, Ints]]:
-    """Return standards of the rows `test` of features (all grasps, M), by variant.
+    """Return standards for the rows `test` of features (all grasps, M), by variant.
 
-    The second result has, for running variants, the grasps (N,) before each test grasp. The rows
-    `pool` calibrate the others.
+    The second result has, for running variants, the number of grasps before each test grasp (N,).
+    `pool`: rows from which the other variants draw.
     """
     random = np.random.default_rng(seed)
     standards = {Variant.NONE: training.prior, Variant.ALL: Standards.of(features[pool])}
@@ -119,7 +119,8 @@ def later_session(
 def _running(
     features: Floats, order: Ints, test: Ints, training: TrainingStandards
 ) -> tuple[Standards, Ints]:
-    """Return standards (len(test), M) and ages (len(test),) at each test row."""
+    """Return standards (len(test), M), and the session's age in grasps (len(test),), at each test
+    row."""
     place = {int(row): index for index, row in enumerate(test)}
     statistics = training.statistics()
     mean = np.empty((len(test), features.shape[1]))

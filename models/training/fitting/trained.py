@@ -49,7 +49,8 @@ class Trained:
     standards: TrainingStandards | None
     """Standards of a session system's features; None for other systems."""
     sensors: TrainingStandards | None
-    """Standards of the counts (fingers * 24,) for a session system, to map tables to `prior`."""
+    """Standards of counts (fingers * 24,) of a session system, to map tables to its `prior`; else
+    None."""
 
     def margins(self, counts: Numbers, table_of: Ints) -> Floats:
         """Return uncalibrated log-odds of slip (N,) of counts (N, fingers, 24) and tables (N,)."""
@@ -73,7 +74,7 @@ class Trained:
         return _moved(values, self.sensors.prior, self.sensors.each(table_of))
 
     def takes(self, sharpness: Sequence[Sharpness] = (Sharpness(0.0, 1.0),)) -> Input:
-        """Return the input as a contract has it; `sharpness` is of a session system alone."""
+        """Return the input for a contract; only a session system uses `sharpness`."""
         if not isinstance(self.system.input, SessionFeatures):
             return self.system.input
         if self.standards is None:
@@ -251,7 +252,7 @@ def _fit_blend(blend: BlendConfig, inputs: Floats32, slipped: Bools, seed: int) 
         fitted = _fit_single(member.estimator, member.recipe, inputs, slipped, member_seed)
         spread = float(fitted.margins(inputs).std())
         members.append(fitted)
-        # A member that judges all grasps alike has learnt nothing, and gets no weight.
+        # A member with the same margin for all grasps has learnt nothing, and gets no weight.
         share = member.weight / (member.copies * total)
         factors.append(share / spread if spread > 0.0 else 0.0)
     return FittedBlend(tuple(members), tuple(factors))
@@ -263,7 +264,8 @@ def augment(
     """Return four times the images (N, height, width, fingers) and labels (N,).
 
     The order is: unchanged, flipped left-right, flipped up-down, rotated. A rotated image keeps its
-    size, and pixels from outside repeat the nearest edge. Raises `ValueError` if `images` are none.
+    size, and pixels from outside repeat the nearest edge. Raises `ValueError` if `images` has
+    another shape.
     """
     if images.ndim != 4:
         raise ValueError(f"only images can be flipped and rotated, not inputs {images.shape[1:]}")

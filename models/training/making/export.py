@@ -27,7 +27,7 @@ class ExportError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Parity:
-    """Difference of a file and its system, over `grasps` grasps."""
+    """Comparison of a file and its system on `grasps` grasps."""
 
     grasps: int
     largest_difference: float
@@ -59,7 +59,7 @@ def export(
     with replacing(path) as part:
         part.write_bytes(model.SerializeToString(deterministic=True))
         parity = _compare(part, fitted, temperature, counts, standards)
-        # Not "greater than": that would let a NaN pass.
+        # Not written with "greater than", which would let a NaN pass.
         if not parity.largest_difference <= TOLERANCE or parity.verdicts_flipped:
             raise ExportError(
                 f"the exported file differs from the system by {parity.largest_difference:.1e} "
@@ -86,7 +86,7 @@ def _compare(
         stable, actual[index] = model.run()
         if not abs(stable + actual[index] - 1.0) <= TOLERANCE:
             raise ExportError(f"probabilities sum up to {stable + actual[index]}")
-    # The logistic function as a tanh: it cannot overflow.
+    # The logistic function is written as a tanh, which cannot overflow.
     expected = 0.5 + 0.5 * np.tanh(0.5 * fitted.margins(inputs) / temperature)
     return Parity(
         grasps=len(counts),

@@ -51,7 +51,7 @@ from graspd.models.training.systems.registry import configuration
 
 LIBRARIES = ("numpy", "onnx", "onnxruntime", "onnxscript", "scikit-learn", "skl2onnx", "torch")
 EXTRA_TRAININGS = 2
-"""Trainings beside the folds and the last three, of the study of broken electrodes."""
+"""Number of trainings beside the folds: the last one, and those of the broken-electrode study."""
 
 PUBLISHED_DATA = "The data is of one hand and 41 objects, lifted in one way."
 WEAK_POINTS = (
@@ -61,7 +61,7 @@ WEAK_POINTS = (
 )
 
 OWN_LICENCE = "whatever the owner of the tables says"
-"""Licence of data without a published table."""
+"""Licence text for data without a published table."""
 
 
 def make_model(
@@ -69,7 +69,7 @@ def make_model(
 ) -> ModelContract:
     """Write `NAME.onnx` and its card `NAME.json` into `out`, which keeps the trainings too.
 
-    `grasps` are those of all tables that there are. `on_done` is called after each of the plan's
+    `grasps`: grasps of all given tables. `on_done`: called after each of the plan's
     jobs and of the `EXTRA_TRAININGS`. Raises `TooFewGraspsError` if the grasps are too few for the
     folds, `ExportError` if the file does not judge as the system does, `OSError` if a folder
     cannot be written.
@@ -114,7 +114,7 @@ def make_model(
         "calibrated_by": calibrator.protocol,
         "broken": None if plan.only else broken_study(system, trained.grasps, plan.seed),
         "never_seen": _never_seen(trained, contract, plan.seed),
-        # Training the first fold again gave bit-identical margins.
+        # Training the first fold again has given bit-identical margins.
         "same_seed_same_margins": first["margin"].equals(again["margin"]),
         "command": plan.command,
         "made_with": made_with(LIBRARIES) | {"machine": platform.machine()},
@@ -126,7 +126,7 @@ def make_model(
 
 
 def _calibrator(measured: list[Figures]) -> Figures:
-    """Return the figures that calibrate probabilities: of new objects, if measured."""
+    """Return the figures that calibrate probabilities: those of new objects, if measured."""
     return measured[min(1, len(measured) - 1)]
 
 
@@ -146,7 +146,7 @@ def _contract(plan: TrainingPlan, trained: Trained, measured: list[Figures]) -> 
 
 
 def _confidence(one: Figures) -> tuple[ConfidenceStep, ...]:
-    """Return the steps with enough grasps; few grasps do not show how often they are right."""
+    """Return the steps of the curve with at least `FEWEST_JUDGED` grasps."""
     rows = one.of_variant()
     return tuple(
         step
@@ -161,7 +161,7 @@ def _measured(one: Figures) -> MeasuredError:
 
 
 def _sharpness(measured: list[Figures]) -> tuple[Sharpness, ...]:
-    """Return the temperatures of a young session, which is never surer than a calibrated one."""
+    """Return the temperatures of a young session, none below that of a calibrated one."""
     base = temperature(_calibrator(measured).of_variant())
     later = next((one for one in measured if one.protocol == "days"), None)
     if later is None or Variant.RUNNING not in later.variants:
@@ -176,12 +176,12 @@ def _sharpness(measured: list[Figures]) -> tuple[Sharpness, ...]:
 def _never_seen(trained: Trained, contract: ModelContract, seed: int) -> dict[str, object]:
     """Return the fractions of readings that the contract's `seen` refuses.
 
-    `held_out_object`: of grasps of an object, by the other objects. `made_up`: of readings that no
-    hand ever made, before any repair, by the way they were made up.
+    `held_out_object`: fraction of an object's grasps refused by the other objects' training.
+    `made_up`: fraction of synthetic readings before any repair, by the way they were made.
     """
     grasps, seen = trained.grasps, contract.seen
     objects, counts = np.array(grasps.objects), trained.mapped(grasps.counts, grasps.table_of)
-    # Two of other objects at least have a covariance.
+    # A covariance needs at least two grasps of other objects.
     several = len(objects) - max(Counter(grasps.objects).values()) > 1
     return {
         "held_out_object": held_out_never_seen(counts, objects, seen.margin) if several else None,
@@ -190,10 +190,8 @@ def _never_seen(trained: Trained, contract: ModelContract, seed: int) -> dict[st
 
 
 def _data_sources(files: Sequence[Dataset]) -> dict[str, object]:
-    """Return licence and sources of the tables used for training or judging.
-
-    Files under `not_published` differ from the published ones: the rest is not about them.
-    """
+    """Return licence and sources of the tables used for training or judging. The rest does not
+    apply to files under `not_published`, which differ from the published ones."""
     not_published = unpublished(files)
     sources: dict[str, object]
     if len(lab_table_names(files)) == len(files):
@@ -234,7 +232,7 @@ def _share(rows: pd.DataFrame) -> dict[str, object]:
 
 
 def _weak_points(measured: Sequence[Figures], grasps: Grasps) -> tuple[str, ...]:
-    """Return sentences on what the model cannot do, with figures; `grasps` are trained on."""
+    """Return sentences with figures on what the model cannot do; `grasps`: its training."""
     texts = []
     for one in measured:
         f1, rows = 100 * one.spread().mean, one.of_variant()

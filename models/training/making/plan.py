@@ -29,7 +29,7 @@ FEWEST_FOLDS = 2
 FEW_OBJECTS = 10
 """Number of objects at which each default fold leaves out one; published tables have 41."""
 FEW_OF_A_KIND = 20
-"""Number of grasps of a kind at which one grasp is 5 % of the knowledge of it."""
+"""Number of grasps below which a share is coarse: one of 20 grasps is 5 %."""
 FEWEST_STANDARD = 2
 """Fewest grasps of a table for a session model; a single grasp has no spread."""
 
@@ -43,9 +43,9 @@ class TrainingPlan:
     seed: int
     processes: int = 1
     only: EvalProtocol | None = None
-    """Protocol that alone measures the model, without the study of broken electrodes.
+    """Only protocol to measure the model by, without the study of broken electrodes.
 
-    It is for a model that is only compared. None: all protocols.
+    It is for a model that is only compared with others. None: all protocols.
     """
     lab_files: tuple[str, ...] = ()
     """File names of the lab tables that are trained on, with their endings."""
@@ -54,14 +54,14 @@ class TrainingPlan:
 
     @property
     def model(self) -> str:
-        """Name of the model and of its files: small-session, small-session-monday."""
+        """Name of the model and of its files, such as small-session or small-session-monday."""
         if self.name is not None:
             return self.name
         words = "-".join((self.system.name, *(Path(name).stem for name in self.lab_files)))
         return re.sub(r"[^A-Za-z0-9._]+", "-", words)[:NAME_MAX].rstrip("-.")
 
     def protocols(self, grasps: Grasps) -> tuple[EvalProtocol, ...]:
-        """Return the protocols that measure it: `cv`, then new objects, which calibrate it."""
+        """Return the protocols of the measurement: `cv`, then new objects, which calibrate it."""
         if self.only is not None:
             return (self.only,)
         there = {file.name for file in grasps.files}
@@ -81,12 +81,12 @@ class TrainingPlan:
         ]
 
     def chosen(self, grasps: Grasps) -> Grasps:
-        """Return the grasps of the tables that the kept model is trained on."""
+        """Return the grasps of the tables on which the final model is trained."""
         return grasps.rows(grasps.rows_of(self.system.tables))
 
     @property
     def command(self) -> str:
-        """Return the command line that repeats it, without folders of this machine."""
+        """Return the command line that repeats the plan, without folders of this computer."""
         published = any(table.name in self.system.tables for table in TABLES)
         data = ["--data DIR"] if published else []
         data += [f"--own {shlex.quote(name)}" for name in self.lab_files]
@@ -99,7 +99,7 @@ class TrainingPlan:
 def preflight(plan: TrainingPlan, grasps: Grasps) -> None:
     """Raise `TooFewGraspsError` if a training of the plan lacks grasps of a label.
 
-    A session model also needs `FEWEST_STANDARD` grasps of each table that it is judged by.
+    A session model also needs `FEWEST_STANDARD` grasps of each table that tests it.
     """
     session = isinstance(plan.system.input, SessionFeatures)
     for where, of, train, test in _trainings(plan, grasps):
@@ -118,8 +118,11 @@ def preflight(plan: TrainingPlan, grasps: Grasps) -> None:
 
 
 def with_enough_folds(plan: TrainingPlan, grasps: Grasps) -> tuple[TrainingPlan, str]:
-    """Return the plan with the most folds, up to its own, that these grasps are enough for, and
-    why they are fewer: "" if they are not. Raises `TooFewGraspsError` if there are none."""
+    """Return the plan, with fewer folds if the grasps are too few for its own, and the reason.
+
+    The reason is "" if the folds stay. Raises `TooFewGraspsError` if the grasps are too few for
+    any.
+    """
     why = ""
     for folds in range(plan.folds, FEWEST_FOLDS - 1, -1):
         fewer = dataclasses.replace(plan, folds=folds)
@@ -164,10 +167,8 @@ def limits(plan: TrainingPlan, grasps: Grasps) -> Iterator[str]:
 
 
 def _trainings(plan: TrainingPlan, grasps: Grasps) -> Iterator[tuple[str, Grasps, Ints, Ints]]:
-    """Yield each training's name and grasps, and the rows for training and judging.
-
-    A session that is calibrated while it is judged needs no training rows.
-    """
+    """Yield each training's name and grasps, and the rows for training and judging. The training
+    rows are empty for a session that is calibrated while it is judged."""
     for protocol in plan.protocols(grasps):
         for split in splits(protocol, grasps, plan.seed, plan.folds):
             alone = protocol == "days" or split.calibration is not None

@@ -1,4 +1,4 @@
-"""Candidates of the report, and their time: graspd's models, and the published code around `cnn1`.
+"""Candidates of the report and their run times: graspd's models, and the published code of `cnn1`.
 
 The published network is not trained here, because its time does not depend on its weights. Steps
 are timed in a hot loop and paced, one candidate after the other in every round.
@@ -29,7 +29,7 @@ from graspd.models.training.estimators.configs import CNN1
 CONFIDENCE = 0.95
 WARM_UP = 20
 ROUNDS = 10
-"""Rounds of the hot loop, so that a busy second spoils only one."""
+"""Rounds of the hot loop, so that a busy second spoils only one of them."""
 PERIOD_S = 0.01
 """Time between paced readings, s. Other work in between makes caches cold."""
 QUANTILES = {"p50": 0.5, "p99": 0.99, "p99.9": 0.999}
@@ -37,11 +37,11 @@ QUANTILES = {"p50": 0.5, "p99": 0.99, "p99.9": 0.999}
 Row = dict[str, Any]
 """One candidate of a report: `name`, `kind` (`model` or `peer`), `fingers`, `error`, `time`."""
 Step = Callable[[int], object]
-"""Does the timed work for the reading of this number."""
+"""Function that does the timed work for the reading with this number."""
 Times = dict[str, float]
 """`hot_p50_us`, `paced_p99_us` and so on, and `cpu_percent_at_100_hz`, the share of a core."""
 Candidate = tuple[Row, Step]
-"""Name, kind, fingers and error of a model or a peer, and what is timed."""
+"""Name, kind, fingers and error of a model or a peer, and its timed step."""
 
 
 def candidates(grasps: Grasps) -> list[Candidate]:
@@ -79,7 +79,7 @@ def _model(model: TactileModel, grasps: Grasps) -> Candidate:
 
 
 def errors(figures: dict[str, Any]) -> dict[str, float]:
-    """Return the figures of a protocol, in 0..1; 95 % of F1 by Nadeau and Bengio's t-test."""
+    """Return the figures of a protocol, 0..1; the 95 % interval of F1 is Nadeau and Bengio's."""
     spreads, folds = figures["spreads"], figures["folds"]
     f1 = spreads["f1"]
     share = figures["test_grasps"] / figures["train_grasps"]
@@ -160,7 +160,7 @@ def measure(steps: Mapping[str, Step], readings: int, paced: int) -> dict[str, T
 
 
 def _hot(steps: Mapping[str, Step], readings: int) -> dict[str, list[int]]:
-    """Wall time of readings right after each other, ns."""
+    """Return the wall time of each reading, ns, one right after the other."""
     times: dict[str, list[int]] = {name: [] for name in steps}
     for _ in range(ROUNDS):
         for name, step in steps.items():
@@ -174,7 +174,7 @@ def _hot(steps: Mapping[str, Step], readings: int) -> dict[str, list[int]]:
 def _paced(
     steps: Mapping[str, Step], readings: int
 ) -> tuple[dict[str, list[int]], dict[str, list[int]]]:
-    """Wall and processor time of readings that are 10 ms apart, ns."""
+    """Return wall and processor time of each reading, ns, 10 ms apart."""
     wall: dict[str, list[int]] = {name: [] for name in steps}
     cpu: dict[str, list[int]] = {name: [] for name in steps}
     due_s = time.perf_counter()

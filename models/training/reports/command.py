@@ -1,4 +1,4 @@
-"""`graspd report WHAT`: what the models cost and how exact they are, measured here and now."""
+"""`graspd report WHAT`: measure cost and errors of the models on this computer."""
 
 from __future__ import annotations
 
@@ -97,4 +97,4 @@ REPORTS = {
         _worth,
     ),
 }
-"""Name: module with `run(args) -> int`, one line of help, what declares the arguments."""
+"""By name: module with `run(args) -> int`, line of help, function that declares arguments."""

@@ -61,13 +61,13 @@ PANELS = (
     (("objects", "objects-whole"), "other objects"),
     (("session",), "another day"),
 )
-"""Protocols and their question; a model has at most one of a group.
-Without the first it was measured on two palm poses only, and is drawn hollow."""
+"""Groups of protocols, and the title of each; a model has at most one protocol of a group. A model
+without the first one of a group was measured on two palm poses only, and is hollow."""
 TIME = "paced_p50_us"
 COLOURS = {"model": BLUE, "peer": ORANGE}
 MARKERS = {"model": "o", "peer": "s"}
 SIZE_IN = (8.6, 3.7)
-"""Size at which the pages show the picture."""
+"""Width and height at which the pages show the picture, inches."""
 KEY = (
     "circle: model of graspd, square: published code, line: 95 % interval, "
     "hollow: on two palm poses only\n"
@@ -130,7 +130,7 @@ def _over_runs(runs: Sequence[Times]) -> Row:
 
 
 def _rank(row: Row) -> tuple[str, float]:
-    """Order models before peers, and the most exact first."""
+    """Return a sort key: models before peers, and those with the smallest error first."""
     return row["kind"], -error_of(row, PANELS[0][0]).get("f1", 0.0)
 
 

@@ -1,4 +1,4 @@
-"""The computer that a report was made on."""
+"""Description of the computer on which a report was made."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 
 def machine() -> dict[str, str]:
-    """Return processor, BLAS and versions, by what they are called in a report."""
+    """Return processor, BLAS and versions of this computer, by their names in a report."""
     return {
         "processor": _processor(),
         "BLAS": _blas(),
@@ -38,7 +38,7 @@ def _blas() -> str:
     """Return numpy's linear algebra, and the processor that its kernels are for, if known."""
     built = np.show_config(mode="dicts")["Build Dependencies"]["blas"]
     try:
-        from threadpoolctl import threadpool_info  # of the extra `train`
+        from threadpoolctl import threadpool_info  # from the extra `train`
     except ModuleNotFoundError:
         kernels = []
     else:

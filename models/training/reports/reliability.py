@@ -1,4 +1,4 @@
-"""How honest `p_slip` is: of the grasps with a probability of 0.1 a tenth should slip.
+"""Calibration of `p_slip`: of the grasps with a probability of 0.1 a tenth should slip.
 
 The learner's scale is fitted on the sessions of some objects and judged on those of the others.
 Rows are those of `streams.live`.
@@ -16,10 +16,10 @@ from graspd.models.training.evaluating.files import markdown_table
 from graspd.models.trust.learner import SCALE
 
 EDGES: Final = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.95, 0.98, 1.0)
-"""Ends of the parts in which `p_slip` is compared with what slipped."""
+"""Limits of the ranges of `p_slip` in which it is compared with the share of slips."""
 SLOPE_MAX: Final = 20.0
 CONFIDENT: Final = 1e-12
-"""A probability nearer to 0 or 1 counts as this one."""
+"""Smallest distance of a probability from 0 and 1; nearer ones are clipped."""
 SPREAD: Final = (0.05, 0.5, 0.95)
 """Quantiles of the sessions' slopes."""
 
@@ -27,7 +27,7 @@ SPREAD: Final = (0.05, 0.5, 0.95)
 def slope(rows: pd.DataFrame) -> float:
     """Return the factor on the log-odds that makes these probabilities the likeliest.
 
-    1: honest. Above: timid. Below: too sure. At most `SLOPE_MAX`.
+    1: calibrated. Above: too near to 0.5. Below: too confident. At most `SLOPE_MAX`.
     """
     p = np.clip(rows["p_slip"].to_numpy(), CONFIDENT, 1.0 - CONFIDENT)
     log_odds = np.log(p / (1.0 - p))
@@ -46,7 +46,7 @@ def slope(rows: pd.DataFrame) -> float:
 def fitted_scales(unscaled: pd.DataFrame) -> dict[tuple[int, int], float]:
     """Return a scale for each split and fold of objects, fitted on the split's other folds.
 
-    `unscaled` are rows of lives with a scale of 1. A fold without others has the learner's.
+    `unscaled`: rows of `live` with a scale of 1. A single fold gets the learner's own scale.
     """
     scales = {}
     for split, rows in after_outcomes(unscaled).groupby("split"):
@@ -62,10 +62,10 @@ def after_outcomes(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def reliability(learning: pd.DataFrame, scales: dict[tuple[int, int], float]) -> dict[str, Any]:
-    """Return what `p_slip` of these lives is worth; they were lived with these scales.
+    """Return the calibration of `p_slip` in rows of `live`, which had these scales.
 
-    `parts`: grasps with a `p_slip` from `low` to `high`, mean of it (`said`) and share that
-    `slipped`. `slope`: of all grasps; `sessions`: of single sessions, at the quantiles `SPREAD`.
+    `parts`: for grasps with a `p_slip` from `low` to `high`, its mean (`said`) and the share that
+    `slipped`. `slope`: of all grasps. `sessions`: slopes of single sessions at `SPREAD`.
     """
     rows = after_outcomes(learning)
     parts = [
@@ -89,7 +89,7 @@ def reliability(learning: pd.DataFrame, scales: dict[tuple[int, int], float]) ->
 
 
 def reliability_lines(figures: dict[str, Any]) -> list[str]:
-    """Return said and actual share of slips by part of `p_slip`, and the slopes."""
+    """Return lines with predicted and actual share of slips by range of `p_slip`, and slopes."""
     rows = [
         [
             f"{part['low']:g} to {part['high']:g}",

@@ -1,4 +1,4 @@
-"""Streams of grasps of another day, and what graspd says of them as outcomes are told.
+"""Streams of grasps of another day, and graspd's verdicts on them as outcomes are reported.
 
 Networks saw neither the objects nor the pose of a stream. The days are those of the protocol
 `days`. Each stream is a session that starts empty, as in the daemon, with the daemon's refusals.
@@ -25,9 +25,9 @@ from graspd.models.trust.learner import SCALE, Learner, sigmoid
 from graspd.models.trust.risk import Permission, Risk, RiskLimits
 
 OWN, PUBLISHED = "small-session", "cnn1"
-"""Systems that judge: graspd's default, and the published network on the plain image."""
+"""Systems that judge: graspd's default, and the published network."""
 DRAWS: Final = 2
-"""Streams of each table, fold and order."""
+"""Number of streams for each table, fold and order."""
 ORDERS: Final = ("random", "by object")
 
 
@@ -93,7 +93,7 @@ def streams(
 
 
 def judged(trained: Trained, grasps: Grasps, rows: Ints) -> tuple[Floats, Floats32, Bools]:
-    """Judge rows as one session; return margins (N,), inputs (N, features) and what is refused."""
+    """Judge rows as one session; return margins (N,), inputs (N, features) and refusals (N,)."""
     day = Day(trained)
     margins, refused = np.empty(len(rows)), np.empty(len(rows), np.bool_)
     inputs = np.empty((len(rows), *day.network.input.shape), np.float32)
@@ -104,10 +104,10 @@ def judged(trained: Trained, grasps: Grasps, rows: Ints) -> tuple[Floats, Floats
 
 
 def live(stream: Stream, limits: RiskLimits, *, every: bool, scale: float = SCALE) -> pd.DataFrame:
-    """Judge, lift and tell one grasp after the other; refused ones are left alone.
+    """Judge, lift and report one grasp after the other; refused grasps are not lifted.
 
-    Without `every`, only stable and supervised grasps are lifted and their outcomes told. `scale`
-    takes the place of the learner's own.
+    `every`: False lifts, and reports, only stable and supervised grasps. `scale` replaces the
+    learner's own.
 
     Returns the stream's rows with the verdict, after the outcomes of the grasps before: `p_slip`,
     NaN of a refused one; `stable`; `supervised`, true if a lift under supervision was asked for;

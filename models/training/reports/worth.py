@@ -1,4 +1,4 @@
-"""`graspd report worth`: what `stable` is worth on another day, from its first grasp on.
+"""`graspd report worth`: reliability of `stable` on another day, from its first grasp on.
 
 Trains graspd's default and the published network on some days. Both judge grasps of another day and
 of other objects, each after the outcomes of those before it.
@@ -49,9 +49,9 @@ WARM_UPS: Final = (0, 20, WARM_UP, 100)
 """Lengths of the warm-up that are compared, outcomes."""
 ALL_DAYS: Final = "all"
 GRASPS: Final = (0, 10, 25, 50, 75, 100, 150, 200, 250, 300)
-"""Ends of the parts that the figures are means of, grasps of the day."""
+"""Limits of the parts of a day over which figures are averaged, grasps since its start."""
 LEAST: Final = 100
-"""Parts with fewer grasps in all streams are left out."""
+"""Fewest grasps of a part, over all streams; smaller parts are left out."""
 PUBLISHED, ALONE, LEARNING, RISK = (
     "the published method (cnn1)",
     "graspd, nothing told",
@@ -65,13 +65,13 @@ BOUND: Final = (
     "so a part of the day may lie above, above all the first"
 )
 SIZE_IN: Final = (8.6, 4.4)
-"""Size at which the pages show the picture."""
+"""Width and height at which the pages show the picture, inches."""
 FONT_PT: Final = 9.0
 BY_GRASP: Final = "slips among `stable` / good lifts kept, %, by grasp of the day"
 
 
 Figures = dict[str, Any]
-"""Fractions by their names, unless a name says otherwise; NaN: of no grasp."""
+"""Figures by name: fractions, unless the name says otherwise; NaN: no grasp."""
 Curves = dict[str, list[Figures]]
 """Figures of the parts of the day, by method: `grasps`, the middle of the part;
 `slips_among_stable`; `coverage`, the share of the grasps that held which were called stable."""
@@ -99,7 +99,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def worth_of(several: Sequence[Stream], command: str) -> Figures:
-    """Live all streams, with scales that were fitted on other objects, and measure them.
+    """Run `live` on all streams, with scales fitted on other objects; return the figures.
 
     `risk` is by target and day, `warm_up` by its length at a target of `ALLOWED`, `days` F1 of
     the judged grasps of a day without outcomes (`alone`) and with.
@@ -144,7 +144,7 @@ def limits(share: float, warm_up: int = WARM_UP) -> RiskLimits:
 
 
 def measured(learning: pd.DataFrame, risk: pd.DataFrame) -> Curves:
-    """Return how often `stable` was said and slipped, over all streams together."""
+    """Return how often grasps were called `stable`, and how often these slipped, in all streams."""
     said = {
         PUBLISHED: learning["published"] < 0.0,
         ALONE: (learning["margin"] < 0.0) & ~learning["refused"],
@@ -167,7 +167,7 @@ def _curve(rows: pd.DataFrame) -> list[Figures]:
 
 
 def risk_figures(rows: pd.DataFrame, target: float, day: str, warm_up: int = WARM_UP) -> Figures:
-    """Return what a target kept in these lives, which are all of one day or of `ALL_DAYS`.
+    """Return the figures under a risk target in rows of `live`, of one day or of `ALL_DAYS`.
 
     `kept`: share of `stable` among the grasps that held, mean of the sessions; `slips`: share of
     slips among all `stable` grasps; `above`: share of the sessions in which more than the target

@@ -1,4 +1,4 @@
-"""Systems in words: what each takes and consists of, the paper's row that it answers, its cost."""
+"""Descriptions of systems: input, layers, the paper's row that each reproduces, training time."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ MINUTES = {
     ("blend-electrodes", "cv"): 3,
     ("cnn1-session", "cv"): 5,
 }
-"""Minutes of the command on two cores, from the times in RESULTS.md; others take one or less."""
+"""Minutes of a system in a protocol on two cores, from RESULTS.md; others take one or less."""
 
 
 def explained() -> Iterator[tuple[str, ...]]:
@@ -45,7 +45,7 @@ def explained() -> Iterator[tuple[str, ...]]:
 
 
 def quick_seconds(system: System) -> float:
-    """Return about how long a training of `--quick` takes, s of one core; mean of all protocols."""
+    """Return the approximate time of a `--quick` training, s of one core, mean of all protocols."""
     match system.estimator:
         case NetworkConfig(hidden=1024):
             return 0.4
@@ -56,7 +56,7 @@ def quick_seconds(system: System) -> float:
 
 
 def layers(estimator: Estimator) -> str:
-    """Return what an estimator consists of: `Conv32 3x3 - MaxPool2 - FC1024`, say."""
+    """Return the parts of an estimator as text, such as `Conv32 3x3 - MaxPool2 - FC1024`."""
     match estimator:
         case NetworkConfig():
             second = estimator.second
@@ -82,7 +82,7 @@ def layers(estimator: Estimator) -> str:
 
 
 def taken(system: System) -> str:
-    """Return what a system takes: layout, fill and composition of its image, say."""
+    """Return the input of a system as text, such as layout, fill and composition of its image."""
     words = _input(system.input)
     if system.augmentation is not None:
         words += ", flipped and rotated too"

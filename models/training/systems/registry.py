@@ -37,7 +37,7 @@ from graspd.models.training.estimators.configs import (
 )
 
 CLIP = 3.0
-"""Limit of standardised session features; one beyond it comes from a sensor that moved."""
+"""Limit of standardised session features. Larger ones come from sensors that have drifted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ class SessionFeatures:
 
 @dataclass(frozen=True, slots=True)
 class Member:
-    """One of the estimators that a blend asks."""
+    """One of the estimators of a blend."""
 
     estimator: NetworkConfig | ClassicalConfig
     recipe: AnyRecipe | None = None
@@ -103,14 +103,14 @@ class System:
 
 
 def digest(system: System) -> str:
-    """Return the SHA-256 of how it is trained, without name, fingers and tables."""
+    """Return the SHA-256 of the system's configuration without name, fingers and tables."""
     parts = configuration(system, "input", "estimator", "recipe", "augmentation", "standardise")
     text = json.dumps(parts, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def configuration(system: System, *fields: str) -> dict[str, Any]:
-    """Return these fields of a system, JSON-ready, and its fingers if they are not all three."""
+    """Return these fields of a system for JSON, and its fingers unless they are all three."""
     names = fields if system.fingers == TABLE_FINGERS else (*fields, "fingers")
     return {name: _plain(getattr(system, name)) for name in names}
 
@@ -172,7 +172,7 @@ def cnn(
     augmentation: Augmentation | None = None,
     takes: ImageInput = IMAGE,
 ) -> System:
-    """Return a convolutional network on tactile images, with the paper's figures of it."""
+    """Return a system: a convolutional network on tactile images, with the paper's figures."""
     return System(name, takes, network, recipe, augmentation, published=published)
 
 
@@ -292,7 +292,7 @@ _FEWER_FINGERS = tuple(
     replace(_SESSION[-1], name=f"small-session-{'-'.join(fingers)}", fingers=fingers)
     for fingers in (*combinations(_HAND, 1), *combinations(_HAND, 2))
 )
-"""The default system for hands with fewer sensors: fewer channels, no padding."""
+"""The default system for hands with fewer sensors; its inputs are those of fewer fingers."""
 
 SYSTEMS = {
     system.name: system

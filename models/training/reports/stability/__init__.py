@@ -17,7 +17,7 @@ from graspd.models.training.reports.stability import chain, trust
 from graspd.models.training.reports.stability.row import Row
 
 OUTCOMES, QUICK_OUTCOMES = 100_000, 3_000
-"""Outcomes that the learner takes in."""
+"""Number of outcomes that the learner takes in, usually and with `--quick`."""
 COLUMNS = ("of", "case", "figures", "answers", "bounds")
 LEGEND = (
     "compared: readings that the network is asked of; the others are flat.",

@@ -1,4 +1,4 @@
-"""Models against their reference in float64: inputs, probabilities and verdicts of readings."""
+"""Compare models with their float64 reference: inputs, probabilities and verdicts of readings."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ P_SLIP_ERROR_MAX = 1e-4
 """Largest error of a probability. A verdict further from its threshold must not flip."""
 THRESHOLD = 0.5
 FLOOR_MARGIN = 1e-9
-"""A spread this near its floor, counts, may count as either side: refused or judged."""
+"""Distance of a spread from its floor, counts, within which refused and judged are both right."""
 THRESHOLD_PAIRS, BISECTIONS = 12, 40
-"""Pairs of a stable and a slipping grasp, and steps from both to the threshold between them."""
+"""Number of pairs of a stable and a slipping grasp, and of bisections between the two."""
 
 
 def rows(name: str, data: Path | None = None) -> Iterator[Row]:
@@ -80,7 +80,7 @@ class Comparison:
         reference: Reference | None,
         state: SessionState | None = None,
     ) -> None:
-        """`reference` is of the same file; `state` is a session to start from."""
+        """`reference`: of the same file; None: not compared. `state`: session to start from."""
         self._model, self._reference = model, reference
         self._judge = GraspJudge.of(model, THRESHOLD)
         self._standard = None
@@ -93,7 +93,7 @@ class Comparison:
 
     def row(self, case: str, counts: Counts, *, never_judged: bool = False) -> Row:
         """Compare on counts (N, fingers, 24); with `never_judged`, none may be judged."""
-        with np.errstate(all="ignore"):  # some cases have NaN and infinity on the way
+        with np.errstate(all="ignore"):  # some cases have NaN and infinity in between
             inputs, spreads, answers = self._asked(counts)
             exact, exact_spreads = exact_input(self._model.contract, counts, self._standard)
             said = [self._opinion(reading) for reading in counts]
@@ -118,13 +118,13 @@ class Comparison:
             figures |= network
             bounds |= {"network": P_SLIP_ERROR_MAX, "flips": 0.0}
             if not self._reference.is_stepped:
-                # Where the answer jumps, the last bit of the input is worth a whole step of it.
+                # Where the answer jumps, the last bit of the input can change it by a whole step.
                 bounds["p_slip"] = P_SLIP_ERROR_MAX
         verdicts = Counter(_said(opinion) for opinion, _ in said)
         return Row(self._model.contract.name, case, figures, bounds, dict(verdicts))
 
     def near_threshold(self, likely: Raw) -> Raw:
-        """Return counts between a stable and a slipping one of `likely`, on both sides."""
+        """Return counts close to the threshold, on both sides, between pairs of `likely` grasps."""
         p_slip = self._asked(likely)[2]
         with np.errstate(invalid="ignore"):
             stable = likely[p_slip < THRESHOLD][:THRESHOLD_PAIRS]
@@ -149,9 +149,10 @@ class Comparison:
         p_slip: NDArray[np.float64],
         judged: list[tuple[Opinion, NDArray[np.float32]]],
     ) -> dict[str, float]:
-        """Return errors of `p_slip`, and the verdicts that flip further off than their bound.
+        """Return errors of `p_slip`, and numbers of verdicts that flip beyond the bound.
 
-        `network`: of the network, fed with the same float32 input. `p_slip`: from the counts on.
+        `network`: error of the network alone, with the same float32 input. `p_slip`: from the
+        counts on.
         """
         reference = self._reference
         if reference is None:
@@ -170,7 +171,7 @@ class Comparison:
         }
 
     def _softened(self, inputs: list[NDArray[np.float32]]) -> NDArray[np.float64]:
-        """Return what should be said of these inputs."""
+        """Return the reference's `p_slip` of these inputs, at a young session's temperature."""
         if not inputs or self._reference is None:
             return np.empty(0)
         answers = self._reference.probabilities(np.array(inputs))
@@ -198,10 +199,8 @@ class Comparison:
         return inputs, spreads, p_slip
 
     def _opinion(self, counts: Counts) -> tuple[Opinion, NDArray[np.float32]]:
-        """Return the judge's opinion, and the input that it was made of.
-
-        Floats, which no driver hands over, go to the network as repaired counts do.
-        """
+        """Return the judge's opinion, and the network input of it. Floats, which no driver gives,
+        reach the network as repaired counts do."""
         if counts.dtype == np.uint16:
             raw = counts.astype(np.uint16)
             railed = (raw == 0) | (raw == COUNT_MAX)
@@ -244,12 +243,12 @@ def _is_wrong(opinion: Opinion) -> bool:
 
 
 def _judgeable(spreads: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Readings (N,) of which the network is asked, by spreads (N, fingers)."""
+    """Return True for readings (N,) that the network judges, by spreads (N, fingers)."""
     return np.array((spreads >= SPREAD_FLOOR_COUNTS).all(axis=1), dtype=np.bool_)
 
 
 def _relative(inputs: NDArray[np.float32], exact: Exact) -> NDArray[np.float64]:
-    """Largest error of each input (N, ...) over the largest magnitude in it, shape (N,)."""
+    """Return each input's largest error over its largest magnitude; (N, ...) to (N,)."""
     axes = tuple(range(1, exact.ndim))
     scale = np.abs(exact).max(axis=axes)
     errors = np.abs(inputs - exact).max(axis=axes) / np.where(scale > 0.0, scale, 1.0)
@@ -258,7 +257,7 @@ def _relative(inputs: NDArray[np.float32], exact: Exact) -> NDArray[np.float64]:
 
 
 def _flips(p_slip: NDArray[np.float64], right: NDArray[np.float64]) -> int:
-    """Count other verdicts where the reference is further from the threshold than the bound."""
+    """Count verdicts unlike the reference's where that is off the threshold by over the bound."""
     other = (p_slip >= THRESHOLD) != (right >= THRESHOLD)
     return int((other & (np.abs(right - THRESHOLD) > P_SLIP_ERROR_MAX)).sum())
 

@@ -1,8 +1,8 @@
-"""Input and answer of a model if nothing were rounded.
+"""Reference for input and answer of a model, nearly without rounding.
 
-Inputs are made in extended precision and by definition, step for step: pixels are filled one by one
-in passes, moments are taken in two passes. No shortcut of `graspd.models.tactile_image` and
-`graspd.models.inputs` is used.
+Inputs are made in extended precision and straight from the definition: pixels are filled one by
+one in passes, moments are taken in two passes. It uses no shortcut of `graspd.models.tactile_image`
+or `graspd.models.inputs`.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ Exact = NDArray[np.longdouble]
 Standard = tuple[Exact, Exact]
 """Mean and spread by which features are standardised, shape (features,) each."""
 CHUNK = 128
-"""Readings at a time: the products of a convolution of these take 30 MB."""
+"""Number of readings at a time; the products of their convolution take 30 MB."""
 STEPPED = frozenset({"TreeEnsembleClassifier", "TreeEnsembleRegressor"})
-"""Operators that jump: the least change of an input may change the answer by a whole step."""
+"""Discontinuous operators: a tiny change of an input may change the answer by a step."""
 
 
 class Reference:
-    """The network of one ONNX file in float64: constants are widened, casts to less are left out.
+    """The network of one ONNX file in float64: constants are widened, narrowing casts left out.
 
     It is evaluated by onnx's own reference implementation, which shares nothing with onnxruntime
     but the file.
@@ -57,7 +57,7 @@ class Reference:
         self._evaluator = ReferenceEvaluator(model)
 
     def probabilities(self, inputs: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Probabilities (N, 2), stable and slip, of inputs (N, *shape) of any float type."""
+        """Return probabilities (N, 2), stable and slip, of inputs (N, *shape) of any float type."""
         wide = inputs.astype(np.float64)
         starts = range(0, len(wide), CHUNK)
         parts = [self._run(wide[start : start + CHUNK]) for start in starts]
@@ -69,7 +69,7 @@ class Reference:
 
 
 def _widen(model: onnx.ModelProto) -> None:
-    """Turn all that is a narrower float into float64, in place."""
+    """Turn all narrower floats of a model into float64, in place."""
     from onnx import TensorProto, numpy_helper
 
     narrow = TensorProto.FLOAT, TensorProto.FLOAT16, TensorProto.BFLOAT16
@@ -129,9 +129,9 @@ def exact_softening(
     temperature: float,
     threshold: float,
 ) -> NDArray[np.float64]:
-    """Return the probability of a young session: the margin over the temperature.
+    """Return the probability of slip in a young session: the margin divided by the temperature.
 
-    Counted from the threshold; probabilities are `TINY` at least, by definition.
+    The margin counts from the threshold; probabilities are at least `TINY`.
     """
     slip = np.maximum(p_slip, TINY).astype(np.longdouble)
     stable = np.maximum(p_stable, TINY).astype(np.longdouble)
@@ -142,14 +142,14 @@ def exact_softening(
 
 
 def _moments(values: Exact) -> tuple[Exact, Exact]:
-    """Mean and population standard deviation over the last axis, in two passes."""
+    """Return mean and population standard deviation over the last axis, in two passes."""
     mean = values.mean(axis=-1)
     deviations = values - mean[..., np.newaxis]
     return mean, np.sqrt((deviations * deviations).mean(axis=-1))
 
 
 def _divided(deviations: Exact, spread: Exact) -> Exact:
-    """Deviations over their spread; zero where it is below the floor or no number."""
+    """Return deviations over their spread; zero if that is below the floor or NaN."""
     sound = spread >= SPREAD_FLOOR_COUNTS
     scale = np.where(sound, spread, 1)[..., np.newaxis]
     quotient: Exact = np.where(sound[..., np.newaxis], deviations / scale, 0)
@@ -189,7 +189,7 @@ def _image(values: Exact) -> tuple[Exact, Exact]:
 
 
 def _filled(values: Exact) -> Exact:
-    """Images (N, fingers, height, width) of counts (N, fingers, 24), paper section II-A."""
+    """Return images (N, fingers, height, width) of counts (N, fingers, 24), paper section II-A."""
     height, width = D1.shape
     images = np.zeros((*values.shape[:2], height, width), dtype=np.longdouble)
     known = np.zeros((height, width), dtype=np.bool_)

@@ -13,7 +13,7 @@ from graspd.models.contract import SeenCounts
 RANDOM_READINGS = 300
 """Readings of each random kind. A model and its reference take up to 1 ms for one."""
 DENORMAL = 5e-310
-"""Below the smallest normal double, 2.2e-308."""
+"""Value below the smallest normal double, 2.2e-308."""
 
 Raw = NDArray[np.uint16]
 Counts = NDArray[np.generic]
@@ -32,12 +32,12 @@ def likely_grasps(seen: SeenCounts, seed: int = 0) -> Raw:
 
 
 def equal(likely: Raw) -> Counts:
-    """All electrodes equal, at four levels."""
+    """Return readings with all electrodes equal, at four levels."""
     return np.stack([np.full_like(likely[0], level) for level in (1, 2, 2000, COUNT_MAX - 1)])
 
 
 def two_levels(lows: tuple[int, ...], step: float) -> Callable[[Raw], Counts]:
-    """Every other electrode is `step` counts above the low level, so that sigma is half of it."""
+    """Return a case: every other electrode is `step` above the low level; sigma is step / 2."""
 
     def make(likely: Raw) -> Counts:
         counts = np.stack([np.full(likely.shape[1:], low, dtype=np.float64) for low in lows])
@@ -48,7 +48,7 @@ def two_levels(lows: tuple[int, ...], step: float) -> Callable[[Raw], Counts]:
 
 
 def one_far_off(likely: Raw) -> Counts:
-    """Each electrode in turn, at three levels, far from the others that are one count apart."""
+    """Return readings with one electrode, each in turn, far from the others, at three levels."""
     counts = np.repeat(two_levels((2000,), 1)(likely), 3 * ELECTRODES, axis=0)
     for electrode in range(ELECTRODES):
         counts[3 * electrode : 3 * electrode + 3, :, electrode] = [[1], [1000], [COUNT_MAX - 1]]
@@ -56,7 +56,7 @@ def one_far_off(likely: Raw) -> Counts:
 
 
 def unequal(factor: float) -> Callable[[Raw], Counts]:
-    """The last finger spreads by 1500 counts times `factor`, the others by 1.5 counts."""
+    """Return a case: the last finger spreads by 1500 counts * `factor`, others by 1.5 counts."""
 
     def make(likely: Raw) -> Counts:
         counts = two_levels((2000, 3000), 3)(likely).astype(np.float64)
@@ -68,26 +68,26 @@ def unequal(factor: float) -> Callable[[Raw], Counts]:
 
 
 def one_finger_dead(likely: Raw) -> Counts:
-    """The first finger reads the same at all electrodes."""
+    """Return readings in which all electrodes of the first finger are equal."""
     dead = likely[:20].copy()
     dead[:, 0] = 2000
     return dead
 
 
 def all_at(level: int) -> Callable[[Raw], Counts]:
-    """All electrodes at this level."""
+    """Return a case with all electrodes at this level."""
     return lambda likely: np.full_like(likely[:1], level)
 
 
 def alternating(likely: Raw) -> Counts:
-    """Every other electrode at the other rail."""
+    """Return readings with the electrodes at the two rails in turns."""
     counts = np.zeros_like(likely[:2])
     counts[0, :, ::2] = counts[1, :, 1::2] = COUNT_MAX
     return counts
 
 
 def one_at_a_rail(likely: Raw) -> Counts:
-    """An electrode in turn at each rail."""
+    """Return readings with one electrode, each in turn, at each rail."""
     counts = likely[: 2 * ELECTRODES].copy()
     for electrode in range(ELECTRODES):
         counts[2 * electrode : 2 * electrode + 2, 0, electrode] = (0, COUNT_MAX)
@@ -95,7 +95,7 @@ def one_at_a_rail(likely: Raw) -> Counts:
 
 
 def one_reads(value: float) -> Callable[[Raw], Counts]:
-    """An electrode in turn reads this value, which no sensor sends."""
+    """Return a case: one electrode, each in turn, has this value, which no sensor sends."""
 
     def make(likely: Raw) -> Counts:
         counts = likely[:ELECTRODES].astype(np.float64)
@@ -107,12 +107,12 @@ def one_reads(value: float) -> Callable[[Raw], Counts]:
 
 
 def all_read(value: float) -> Callable[[Raw], Counts]:
-    """All electrodes read this value."""
+    """Return a case: all electrodes have this value."""
     return lambda likely: np.full(likely[:1].shape, value)
 
 
 def random_counts(likely: Raw) -> Counts:
-    """Any counts of 12 bits."""
+    """Return readings of random 12-bit counts."""
     random = np.random.default_rng(0)
     return random.integers(0, COUNT_MAX + 1, likely.shape).astype(np.uint16)
 
@@ -137,7 +137,7 @@ NEVER_JUDGED: dict[str, Callable[[Raw], Counts]] = {
     "all electrodes read denormal": all_read(DENORMAL),
     "all electrodes read negative zero": all_read(-0.0),
 }
-"""Cases of which no reading may be judged."""
+"""Cases whose readings must all be refused."""
 READINGS: dict[str, Callable[[Raw], Counts]] = NEVER_JUDGED | {
     "one electrode far off": one_far_off,
     "fingers' spreads 1e6 apart": unequal(1e3),

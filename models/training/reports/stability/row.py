@@ -1,4 +1,4 @@
-"""A row of `graspd report stability`: what was measured of one case, and its bounds."""
+"""A row of `graspd report stability`: figures of one case, and their bounds."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ class Row:
     """Figures of one case. A row is broken if a figure is NaN or above its bound."""
 
     of: str
-    """Name of a model, or of the part that is measured."""
+    """Name of the model or part that was measured."""
     case: str
     figures: dict[str, float]
     bounds: dict[str, float]
     """Largest value that a figure may have, by its name."""
     answers: dict[str, int] = field(default_factory=dict)
-    """Number of readings by verdict, and by why they have none."""
+    """Number of readings by verdict, or by the reason why they have none."""
 
     @property
     def broken(self) -> list[str]:

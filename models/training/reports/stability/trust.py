@@ -1,7 +1,7 @@
-"""Learner, risk limit and session statistics under streams made up for the worst.
+"""Test learner, risk rule and session statistics with worst-case streams.
 
-The statistics of a session that has lasted for a billion grasps are compared with a closed form,
-the rule's budget with fractions.
+The statistics after a billion grasps are compared with a closed form, the rule's budget with
+fractions.
 """
 
 from __future__ import annotations
@@ -22,55 +22,55 @@ from graspd.models.trust.risk import Permission, Risk, RiskLimits
 
 Random = np.random.Generator
 Outcome = tuple[float, NDArray[np.float64], bool]
-"""Margin, inputs, whether it slipped."""
+"""Margin and inputs of a grasp; True if it slipped."""
 INPUTS = 78
-"""A session's features of the whole hand: the largest learner there is."""
+"""Number of inputs: session features of the whole hand, for the largest learner."""
 CLIP, INPUT_MAX = 3.0, 1000.0
-"""Limits of a session's features, and of what the learner takes."""
+"""Limits of session features, and of inputs that the learner accepts."""
 MEAN_MAX, DRIFT = 25.0, 2e-3
 GRASPS = 128
-"""Told grasps with a residual."""
+"""Number of grasps with a residual in the learner's state."""
 PRIOR = np.array([*np.array([0.5, 0.5, *[0.2] * INPUTS]) ** 2, *[9.009] * GRASPS])
 """Variances of the weights (of the margin, the bias and the features) and of the residual."""
 CHECKS = 100
 """Number of checks of the covariance during the longest stream."""
 ERROR_MAX = 1e-6
-"""Slips. A bound is a sum of shares."""
+"""Tolerance of a bound, slips, because it is a rounded sum of shares."""
 EIGENVALUE_MIN = 0.99 * DRIFT * 0.009
 """Limit that the learner's docstring derives, with room for rounding."""
 ALPHAS = (0.001, 0.003, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5)
 LIFTS = 20_000
 BUDGET_ERROR_MAX = 1e-9
-"""Slips. A lift rounds by 1e-15."""
+"""Tolerance of the budget, slips. Each lift rounds by 1e-15."""
 
 WIDTH = 24
 UPDATES = 4000
-"""At full weight 2e-6 of what was before is left after them, and of its rounding too."""
+"""Number of updates at full weight, after which 2e-6 of the former state and its errors is left."""
 SESSION_ERROR_MAX = 1e-10
 """Largest relative error of a mean or spread. One update rounds by 1e-16, and 301 of them add up
 before they have faded."""
 SPIKE_AT = 3900
-"""Update with the spike, so late that its weight is still there at the end."""
+"""Number of the update with the spike, so late that its weight remains at the end."""
 STILL, CLOSE, SPIKED = 0, 1, 2
-"""Columns: an electrode that never moves, one at 4000 +- 0.5 counts, one with a spike."""
+"""Columns of electrodes: one that never moves, one at 4000 +- 0.5 counts, one with a spike."""
 PRIOR_MEAN, PRIOR_SPREAD = 2000.0, 300.0
 
 
 def varied(random: Random) -> Iterator[Outcome]:
-    """Features of all kinds; the first one matters."""
+    """Yield outcomes of varied features, of which the first decides."""
     while True:
         inputs = random.normal(0.0, 1.0, INPUTS).clip(-CLIP, CLIP)
         yield float(random.normal(0.0, 2.0)), inputs, bool(inputs[0] + random.normal() > 0.0)
 
 
 def constant(random: Random) -> Iterator[Outcome]:
-    """The same features, outcomes at random."""
+    """Yield random outcomes of always the same features."""
     while True:
         yield 1.0, np.full(INPUTS, 0.5), bool(random.random() < 0.5)
 
 
 def at(limit: float, margin: float) -> Callable[[Random], Iterator[Outcome]]:
-    """Features at a limit, and margins of this size."""
+    """Return a stream of features at a limit, with margins of this size."""
 
     def stream(random: Random) -> Iterator[Outcome]:
         while True:
@@ -81,7 +81,7 @@ def at(limit: float, margin: float) -> Callable[[Random], Iterator[Outcome]]:
 
 
 def contradicting(random: Random) -> Iterator[Outcome]:
-    """The same grasp slips and stays in turns."""
+    """Yield the same grasp, which slips and holds in turns."""
     inputs = random.uniform(-CLIP, CLIP, INPUTS)
     while True:
         yield 5.0, inputs, True
@@ -89,7 +89,7 @@ def contradicting(random: Random) -> Iterator[Outcome]:
 
 
 def against_the_margin(random: Random) -> Iterator[Outcome]:
-    """Slips where the network is surest of a stable grasp."""
+    """Yield slips of grasps that the network is surest are stable, and the reverse."""
     while True:
         yield -30.0, CLIP * np.eye(INPUTS)[random.integers(INPUTS)], True
 
@@ -105,7 +105,7 @@ STREAMS: dict[str, Callable[[Random], Iterator[Outcome]]] = {
 
 
 def rows(outcomes: int) -> Iterator[Row]:
-    """Yield the rows of what belongs to no model; the learner takes in `outcomes`."""
+    """Yield the rows of all parts that belong to no model. `outcomes`: number for the learner."""
     yield learner_row(outcomes)
     for alpha in ALPHAS:
         tries = itertools.product((1, 20), (1.0, 2.0))
@@ -120,7 +120,7 @@ def rows(outcomes: int) -> Iterator[Row]:
 
 
 def learner_row(outcomes: int) -> Row:
-    """Tell a learner `outcomes` of all streams in turns; its covariance must stay sound."""
+    """Report `outcomes` of all streams in turns to a learner; check its covariance."""
     random, learner = np.random.default_rng(0), Learner(INPUTS)
     streams = [stream(random) for stream in STREAMS.values()]
     eigenvalues, variances, means, asymmetric = [], [], [], 0
@@ -134,7 +134,7 @@ def learner_row(outcomes: int) -> Row:
         eigenvalues.append(float(np.linalg.eigvalsh(covariance)[0]))
         variances.append(float((covariance.diagonal() / PRIOR[:size]).max()))
         means.append(float(np.abs(mean).max()))
-    # NaN must not get lost in `min` and `max`.
+    # `min` and `max` may lose NaN.
     figures = {
         "asymmetric": float(asymmetric),
         "floor / eigenvalue": float(np.max(EIGENVALUE_MIN / np.array(eigenvalues))),
@@ -164,7 +164,7 @@ def beyond_the_bound(alpha: float, late: int, slips_from: float) -> float:
         if allowed:
             waiting.append(rule.budget >= slips_from)
         elif not waiting:
-            break  # silent for ever
+            break  # nothing is `stable` any more
         if len(waiting) == late or not allowed:
             for slipped in waiting:
                 rule.take(stable=True, slipped=slipped, proves=True)
@@ -209,7 +209,7 @@ def statistics_row(case: str, spike: float | None) -> Row:
 def closed_form(
     values: NDArray[np.float64],
 ) -> tuple[NDArray[np.longdouble], NDArray[np.longdouble]]:
-    """Weighted mean and spread: a grasp weighs 300/301 of what it did, with each after it."""
+    """Return weighted mean and spread; each later grasp scales a grasp's weight by 300/301."""
     horizon = np.longdouble(HORIZON_GRASPS)
     fade = horizon / (horizon + 1)
     weights = fade ** np.arange(len(values), 0, -1).astype(np.longdouble)
