@@ -1,5 +1,5 @@
 /* SPDX-License-Identifier: MIT */
-/* Where the simulated sensors' counts come from: a pattern, or rows of numbers. */
+/* Source of the simulated sensors' counts: a pattern, or rows of numbers. */
 #ifndef GRASPD_COUNTS_H
 #define GRASPD_COUNTS_H
 
@@ -16,7 +16,7 @@ struct counts {
     bool rewindable; /* a file is played again from its first row; a stream ends */
     unsigned sensors;
     bool begun;
-    uint32_t row;       /* row at hand */
+    uint32_t row;       /* current row */
     unsigned long line; /* line of the file, for messages */
     uint16_t value[COUNTS_SENSORS_MAX][SIM_ELECTRODES];
 };
@@ -26,7 +26,7 @@ enum counts_result { COUNTS_OK, COUNTS_END, COUNTS_BAD };
 /* The pattern (`path` NULL), standard input ("-"), or a file. False if it cannot be opened. */
 bool counts_open(struct counts *counts, const char *path, unsigned sensors);
 
-/* Make row `row` the row at hand. Rows are taken in order; row 0 begins a file again. A row is a
+/* Make row `row` the current row. Rows are taken in order; row 0 begins a file again. A row is a
  * line of sensors * 24 numbers 0..4095, sensor by sensor, apart by spaces or commas; lines that
  * begin with # are skipped. */
 enum counts_result counts_take(struct counts *counts, uint32_t row);

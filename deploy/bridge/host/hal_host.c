@@ -18,9 +18,9 @@
 struct host_port host_port = {.master = -1, .slave = -1};
 
 /* ---- time ------------------------------------------------------------------------------------
- * Waits and SPI bytes move simulated time on and take no real time, so that however the operating
- * system schedules this process no sensor is read too early. Before the link is touched, real time
- * has to catch up: no byte reaches the host before the time that stands in it. */
+ * Waits and SPI bytes move simulated time on and take no real time, so that no sensor is read
+ * too early, however the operating system schedules this process. Before the link is touched, real
+ * time has to catch up: no byte reaches the host before the time that stands in it. */
 
 static uint64_t monotonic_ns(void)
 {

@@ -211,7 +211,7 @@ static void take_options(struct options *options, int count, char **argument)
     host_port.sensors = options->config.sensors;
 }
 
-/* ---- what the sensors feel ------------------------------------------------------------------- */
+/* ---- counts of the sensors ------------------------------------------------------------------- */
 
 static void apply_outages(const struct options *options, uint32_t sweeps)
 {
@@ -227,7 +227,7 @@ static void apply_outages(const struct options *options, uint32_t sweeps)
     }
 }
 
-/* False when the stream of counts has ended. */
+/* Return false when the stream of counts has ended. */
 static bool apply_counts(struct counts *counts, uint32_t row)
 {
     unsigned i;
@@ -281,7 +281,7 @@ static void make_link(const char *path)
     (void)atexit(remove_link);
 }
 
-/* Until the counts end. */
+/* Run until the counts end. */
 static void run(struct bridge *bridge, const struct options *options, struct counts *counts)
 {
     for (;;) {

@@ -13,7 +13,7 @@ enum { SIM_ELECTRODES = 24, SIM_TEXT = 16, SIM_SETTLE_NS = 50000 };
 enum sim_answer { SIM_NOTHING, SIM_WORD, SIM_PROPERTY };
 
 struct sim_sensor {
-    /* What it feels and is; may be changed at any time between two transactions. */
+    /* Settings of the sensor; may be changed at any time between two transactions. */
     uint16_t count[SIM_ELECTRODES]; /* 0..4095 */
     char serial[SIM_TEXT];          /* NUL-padded */
     bool unplugged;                 /* MISO is pulled up: every byte is 0xFF */
@@ -22,10 +22,10 @@ struct sim_sensor {
     uint16_t forced_word[SIM_ELECTRODES];
     uint64_t settle_ns; /* least time between a command and its answer, figure 14 */
 
-    /* What it is doing. */
+    /* State of the protocol. */
     bool selected;
     bool awake;     /* a property was read before */
-    bool streaming; /* command 0xA1 was sent: nothing but silence any more */
+    bool streaming; /* command 0xA1 was sent: the sensor stays silent */
     uint8_t command[2];
     unsigned at; /* byte of the transaction */
     enum sim_answer answer;

@@ -1,5 +1,5 @@
 /* SPDX-License-Identifier: MIT */
-/* What a builder may change: sensors, sequence, period, pins and clock of SPI.
+/* Settings of a build: sensors, sequence, period, pins and clock of SPI.
  * Each can be given to CMake as well: -DBRIDGE_SENSORS=5. */
 #ifndef GRASPD_PICO_CONFIG_H
 #define GRASPD_PICO_CONFIG_H

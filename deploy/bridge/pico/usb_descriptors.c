@@ -1,5 +1,5 @@
 /* SPDX-License-Identifier: MIT */
-/* What the board tells the host about itself. The names are those of every Pico, so that its port
+/* The board as the host sees it on USB. The names are those of every Pico, so that its port
  * is /dev/serial/by-id/usb-Raspberry_Pi_Pico_<board id>-if00 whichever port of the firmware it
  * runs. */
 #include "bridge.h"

@@ -53,16 +53,15 @@ struct bridge {
     size_t tx_first, tx_used;
 };
 
-/* Look for the sensors and have the first HELLO ready. False if the configuration is not one that
- * may run: a number out of range, or a command that is not a sampling command (0xA1 among them,
- * manual table 7). */
+/* Look for the sensors and prepare the first HELLO. False if the configuration must not run: a
+ * number is out of range, or a command is not a sampling command (0xA1, manual table 7). */
 bool bridge_init(struct bridge *bridge, const struct bridge_config *config);
 
 /* Do what is due: at most one sweep, some bytes from the host, a STATUS, bytes to the host. Call
  * without end. */
 void bridge_poll(struct bridge *bridge);
 
-/* When bridge_poll has something to do even if no byte moves, in ticks. */
+/* Time, in ticks, at which bridge_poll has something to do even if no byte moves. */
 uint64_t bridge_due_us(const struct bridge *bridge);
 
 #ifdef __cplusplus

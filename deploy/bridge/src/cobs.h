@@ -19,8 +19,8 @@ extern "C" {
 struct cobs_encoder {
     uint8_t *out;
     size_t at;      /* bytes written */
-    size_t code_at; /* where the code of the block at hand goes */
-    uint8_t code;   /* 1 + bytes in the block at hand */
+    size_t code_at; /* place for the code of the current block */
+    uint8_t code;   /* 1 + bytes in the current block */
 };
 
 /* Begin to encode into `out`, which must hold COBS_ENCODED_MAX of all that will be put. */

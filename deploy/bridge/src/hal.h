@@ -29,10 +29,10 @@ uint8_t hal_spi_transfer(uint8_t byte);
 /* Bytes from the host, at most `size`, possibly none. Does not wait. */
 size_t hal_link_read(uint8_t *data, size_t size);
 
-/* Hand bytes to the host's side; gives how many were taken, possibly none. Does not wait. */
+/* Send bytes to the host; returns how many were taken, possibly none. Does not wait. */
 size_t hal_link_write(const uint8_t *data, size_t size);
 
-/* What tells this board from others of its kind: ASCII, NUL-padded. */
+/* Unique id of this board: ASCII, NUL-padded. */
 void hal_board_id(char board[PROTOCOL_TEXT]);
 
 #ifdef __cplusplus

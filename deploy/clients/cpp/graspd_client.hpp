@@ -1,4 +1,4 @@
-// May the hand lift? The newest verdict of a graspd daemon, and `unknown` where there is none.
+// May the hand lift? Client of a graspd daemon: its newest verdict, or `unknown` without one.
 //
 // One header to copy: C++17, Linux, cppzmq and nlohmann-json (apt install cppzmq-dev
 // nlohmann-json3-dev, link with -lzmq). The messages are those of deploy/wire/README.md, version 1;
@@ -43,7 +43,7 @@ namespace graspd {
 
 using Nanoseconds = std::int64_t;
 
-constexpr std::int64_t VERSION = 1;  // of the messages; what has another is not understood
+constexpr std::int64_t VERSION = 1;  // version of the messages; others are refused
 constexpr std::uint64_t INTEGER_MAX = std::uint64_t{1} << 60;  // as a time, 36 years in ns
 constexpr double REAL_MAX = 1e12;                              // as a time, thirty years in ms
 constexpr double WAIT_MAX_S = 1e9;                             // of a call: thirty years
@@ -52,37 +52,37 @@ constexpr std::size_t MESSAGE_MAX_BYTES = 1 << 16;
 // Of lists and objects in a message, and so its depth; a verdict has ten.
 constexpr std::ptrdiff_t OPENINGS_MAX = 100;
 constexpr int QUEUE_MAX = 1000;  // messages that wait to be read: ten seconds at 100 Hz
-// A client that has not read for longer reconnects: what waits is old, and newer ones are lost.
+// A client that has not read for longer reconnects, because its queue is old and full.
 constexpr Nanoseconds READ_WITHIN_NS = 5'000'000'000;
 // A client without a message for this long reconnects, at first and at most: libzmq does not try
 // a refused peer again, which may be let in by now.
 constexpr Nanoseconds QUIET_NS = 1'000'000'000, QUIET_MAX_NS = 10'000'000'000;
-// The computer has slept if its clocks have moved apart by more. A sleep takes seconds, the
+// The computer has slept if its two clocks differ by more. A sleep takes seconds, the
 // scheduler a moment between two looks at the clocks.
 constexpr Nanoseconds SLEPT_NS = 50'000'000;
 // Longest wait in one piece: so well is it known when a message came from another computer.
 constexpr std::int64_t SLICE_MS = 10;
-// What a message may come from the future by before the clocks count as different ones.
+// Most by which a message's time may be in the future while the clocks count as the same.
 constexpr Nanoseconds CLOCK_SLACK_NS = 1'000'000;
-// By which two computers' clocks may run apart: NTP slews by 5e-4, a bad crystal is off by 1e-4.
+// Largest drift between two computers' clocks: NTP slews by 5e-4, a bad crystal is off by 1e-4.
 constexpr double DRIFT = 1e-3;
-// By which they may have run apart in all: a delay that grows as slowly looks the same.
+// Largest total drift. A delay that grows as slowly looks the same.
 constexpr Nanoseconds DRIFT_MAX_NS = 20'000'000;
-// Between two questions for the daemon's clock, and after one that was not answered.
+// Time between two questions for the daemon's clock, also after an unanswered one.
 constexpr Nanoseconds CLOCK_EVERY_NS = 1'000'000'000, CLOCK_RETRY_NS = 10'000'000'000;
-constexpr std::size_t FORMER_MAX = 16;  // starts of the daemon that are remembered as over
-// On TCP: between two signs of life, and when a daemon that gives none is connected to again.
+constexpr std::size_t FORMER_MAX = 16;  // ended starts of the daemon that are remembered
+// On TCP: time between two heartbeats, and time without one until reconnecting.
 constexpr int HEARTBEAT_MS = 1000, HEARTBEAT_TIMEOUT_MS = 3000;
 constexpr std::size_t OBJECT_MAX = 64;  // characters of an object's name
 constexpr std::size_t NAME_BYTES = 16;   // of a client's name
-constexpr std::size_t LIFTS_MAX = 256;  // that are remembered: as many as graspd takes outcomes of
-constexpr std::int64_t WARN_EVERY = 10;  // lifts whose outcome was never told
+constexpr std::size_t LIFTS_MAX = 256;  // lifts that are remembered, as in graspd
+constexpr std::int64_t WARN_EVERY = 10;  // unreported lifts for each warning
 // Longest wait at the end until graspd has received that no lift follows, and most connections
 // that say so at a time.
 constexpr int TAKE_BACK_MS = 200;
 constexpr std::size_t LEAVING_MAX = 4;
 
-// What graspd decided about a grasp; the numbers are those of `verdict_code`.
+// graspd's decision about a grasp; the numbers are those of `verdict_code`.
 enum class Decision { unknown = 0, stable = 1, slip = 2 };
 
 // The wire's word for it.
@@ -91,7 +91,7 @@ inline const char* name(Decision decision) {
     return names[static_cast<int>(decision)];
 }
 
-// What a finger feels.
+// State of a finger.
 enum class FingerState { free, touch, slide };
 
 // The wire's word for it.
@@ -103,18 +103,18 @@ inline const char* name(FingerState state) {
 // How a lift ended.
 enum class Outcome { held, slipped, not_lifted };
 
-// Outcomes of `stable` lifts: `lifts` were told, `slips` of them slipped.
+// Outcomes of `stable` lifts: number of `lifts` with a known outcome, and of `slips` among them.
 struct Risk {
     std::optional<double> target;  // share of slips that is allowed; none: no risk is set
     std::int64_t lifts = 0, slips = 0;
     std::int64_t outstanding = 0;  // outcomes that can still come
-    std::optional<double> bound;   // of `slips`; each outstanding lift adds one
+    std::optional<double> bound;   // upper bound of `slips`; each outstanding lift adds one
     std::int64_t warm_up_left = 0;  // outcomes until most grasps need no supervision
     std::int64_t announced = 0;     // `lift` questions that were answered `stable`
-    std::int64_t awaited = 0;  // those without an outcome; too many, and nothing is `stable`
+    std::int64_t awaited = 0;  // announced lifts without an outcome; too many forbid `stable`
 };
 
-// What is known of the grasp. True in an `if` exactly when it is stable; then no person need watch.
+// Verdict on the grasp. True in an `if` exactly when it is stable; then no person need watch.
 struct Verdict {
     Decision decision = Decision::unknown;
     // Why it is unknown: the daemon's reasons, or one of those in deploy/clients/README.md.
@@ -123,22 +123,22 @@ struct Verdict {
     std::optional<std::int64_t> grasp;   // number of the contact episode
     std::optional<std::int64_t> seq;
     std::string boot_id;                 // empty before the first message
-    std::optional<double> age_ms;        // since the reading's last byte, at least
-    std::optional<double> p_slip_model;  // what the network alone says
-    std::int64_t outcomes = 0;           // of lifts, that `p_slip` rests on
-    bool supervised = false;             // its lift would teach, but only while a person watches
+    std::optional<double> age_ms;        // least time since the reading's last byte
+    std::optional<double> p_slip_model;  // the same by the network alone
+    std::int64_t outcomes = 0;           // number of outcomes that `p_slip` rests on
+    bool supervised = false;             // graspd would learn from the lift; a person must watch
     std::optional<Risk> risk;
     // Judged when nothing moved fast, but something might still slide slowly.
     bool early = false;
     // For how long the hand has been still: from 100 on nothing moves fast, from 240 on nothing
     // slides slowly either; none if the daemon does not say.
     std::optional<double> still_ms;
-    // How each finger moves, in units of its own noise, none where that is not known; and what it
-    // is at most while it is still.
+    // Motion of each finger, in units of its own noise, none if not known; and the largest motion
+    // that counts as still.
     std::map<std::string, std::optional<double>> motion;
     std::map<std::string, double> motion_limits;
-    // What each finger feels, none where that is not known, and always where the reading is older
-    // than `max_age_ms`.
+    // State of each finger; none if not known, and always if the reading is older than
+    // `max_age_ms`.
     std::map<std::string, std::optional<FingerState>> fingers;
     // `you` if you report the outcome of the lift, `another` if another controller does, which may
     // be lifting; empty if the daemon does not say.
@@ -146,7 +146,7 @@ struct Verdict {
 
     explicit operator bool() const { return decision == Decision::stable && !supervised; }
 
-    // The same, but unknown, and not to be lifted.
+    // Returns the same verdict as unknown for these reasons, which forbids a lift.
     Verdict unknown(std::vector<std::string> why) const {
         Verdict same = *this;
         same.decision = Decision::unknown;
@@ -159,48 +159,49 @@ struct Verdict {
 
 // Whether to lift. True in an `if` exactly when the hand may.
 struct LiftAnswer {
-    Verdict verdict;  // what it was decided by; besides its usual reasons `no-answer` and `late`
+    Verdict verdict;  // that decided; its reasons may also be `no-answer` and `late`
     double waited_s = 0.0;
-    // It may, but only while a person watches; never true unless such lifts were asked for.
+    // True if the hand may lift only while a person watches; such lifts must be requested.
     bool supervised = false;
 
     explicit operator bool() const { return static_cast<bool>(verdict) || supervised; }
 };
 
-// Words of the fingers during a lift. True in an `if` exactly when it is to be stopped.
+// Answer about a lift by its fingers. True in an `if` exactly when it must be stopped.
 struct SlideAnswer {
     Verdict verdict;  // the newest; its `fingers` and `reasons` say what is known
     double waited_s = 0.0;
     std::vector<std::string> sliding = {};  // fingers along which something slides
-    // All fingers that touched still did when the time was over, and nothing slid.
+    // True if until the timeout nothing slid and each finger that touched still touches.
     bool held = false;
 
     explicit operator bool() const { return !held; }
 };
 
-// Whether graspd has taken how a lift ended. True in an `if` exactly when it has.
+// Answer to an outcome. True in an `if` exactly when graspd has taken it.
 struct OutcomeAnswer {
-    // Why not: the daemon's words, or `no-answer`, `malformed`, `version` or `other-process`.
+    // Why it was not taken: the daemon's text, or `no-answer`, `malformed`, `version` or
+    // `other-process`.
     std::string why;
 
     explicit operator bool() const { return why.empty(); }
 };
 
-// What came since the start.
+// Numbers of messages since the start.
 struct Counts {
-    std::int64_t messages = 0;   // new ones of this hand
-    std::uint64_t lost = 0;      // gaps in `seq`, in messages
+    std::int64_t messages = 0;   // new messages of this hand
+    std::uint64_t lost = 0;      // messages missing by gaps in `seq`
     std::int64_t repeats = 0;    // messages that were known already
-    std::int64_t malformed = 0;  // messages that are not understood, answers too
+    std::int64_t malformed = 0;  // messages and answers that are not understood
     std::int64_t restarts = 0;   // times that the daemon was started again
-    std::int64_t former = 0;     // messages of a start that is over
+    std::int64_t former = 0;     // messages of an earlier start of the daemon
 };
 
-// CURVE keys, Z85: the daemon's public one, and one's own two.
+// CURVE keys, Z85: the daemon's public key, and the client's own pair.
 struct Keys {
     std::string server_key, public_key, secret_key;
 
-    // From the daemon's `.key` and one's own `.key_secret` file (`graspd keys`).
+    // Returns the keys in the daemon's `.key` and the client's `.key_secret` file (`graspd keys`).
     // Throws `std::runtime_error`.
     static Keys load(const std::string& server, const std::string& own) {
         return {value(server, "public-key"), value(own, "public-key"), value(own, "secret-key")};
@@ -222,17 +223,17 @@ private:
 struct Options {
     std::string endpoint;
     std::string hand = "right";
-    double max_age_ms = 100.0;  // how old a reading may be that a lift relies on
-    // `[ask]`; with it `may_i_lift` asks for a judgement as well, and `tell` has whom to tell.
+    double max_age_ms = 100.0;  // largest age of a reading that permits a lift
+    // `[ask]`: socket at which `may_i_lift` asks for a judgement and `tell` reports.
     std::string ask_endpoint = {};
-    // Whether the daemon's monotonic clock is one's own. Unless given, it is with ipc:// and on
-    // loopback addresses: say false through a tunnel.
+    // True if the daemon's monotonic clock is also the client's. None: true for ipc:// and loopback
+    // addresses, so pass false for a tunnel.
     std::optional<bool> same_computer = {};
     std::optional<Keys> keys = {};
-    // A `stable` with this `p_slip` or more does not count: the scene's `slip_threshold`, if that
-    // is higher.
+    // A `stable` with this `p_slip` or more counts as unknown. Pass the scene's `slip_threshold` if
+    // that is higher.
     double max_p_slip = 0.5;
-    // Is told of lifts that were allowed and whose outcome was not: of the first and each tenth.
+    // Called for allowed lifts whose outcome was not reported: for the first and each tenth.
     std::function<void(const std::string&)> warn = [](const std::string& text) {
         std::cerr << "graspd_client: " << text << '\n';
     };
@@ -248,7 +249,7 @@ inline Nanoseconds now_ns(clockid_t clock = CLOCK_MONOTONIC) {
     return static_cast<Nanoseconds>(now.tv_sec) * 1'000'000'000 + now.tv_nsec;
 }
 
-// How long the computer has slept, and something constant: only the first clock counts that.
+// Returns the time slept plus a constant, ns: the difference of two clocks.
 inline Nanoseconds slept_ns() {
     const Nanoseconds awake_and_asleep_ns = now_ns(CLOCK_BOOTTIME);
     return awake_and_asleep_ns - now_ns();
@@ -264,7 +265,7 @@ using Key = std::pair<std::string, std::int64_t>;  // names a grasp
 
 inline Key key(const Verdict& said) { return {said.boot_id, said.grasp.value_or(0)}; }
 
-// What matters of a verdict message.
+// Used fields of a verdict message.
 struct Message {
     Verdict verdict;               // without its age
     Nanoseconds read_ns = 0;       // by the daemon's clock: when the reading's last byte came ...
@@ -316,14 +317,14 @@ inline Risk risk(const json& told) {
     Risk found{maybe(told, "target", 1.0), integer(told, "lifts"), integer(told, "slips"),
                integer(told, "outstanding"), maybe(told, "bound", REAL_MAX),
                integer(told, "warm_up_left")};
-    // What older daemons leave out.
+    // Older daemons leave these out.
     if (told.contains("announced")) found.announced = integer(told, "announced");
     if (told.contains("awaited")) found.awaited = integer(told, "awaited");
     if (found.slips > found.lifts) throw Malformed{};
     return found;
 }
 
-// What daemons that know nothing of outcomes leave out.
+// Reads the fields that daemons without learning leave out.
 inline void trust(const json& told, Verdict& found) {
     if (told.contains("p_slip_model")) found.p_slip_model = maybe(told, "p_slip_model", 1.0);
     if (found.p_slip_model && !found.p_slip) throw Malformed{};
@@ -340,7 +341,7 @@ inline void trust(const json& told, Verdict& found) {
         });
 }
 
-// What a finger feels; none where that is not known.
+// Returns the state of a finger; none if not known.
 inline std::optional<FingerState> finger_state(const json& told) {
     if (told.is_null()) return std::nullopt;
     const std::string word = text(told);
@@ -349,7 +350,7 @@ inline std::optional<FingerState> finger_state(const json& told) {
     throw Malformed{};
 }
 
-// The fingers that feel it.
+// Returns the fingers in this state.
 inline std::vector<std::string> feeling(const Verdict& said, FingerState state) {
     std::vector<std::string> found;
     for (const auto& [finger, felt] : said.fingers)
@@ -357,7 +358,7 @@ inline std::vector<std::string> feeling(const Verdict& said, FingerState state) 
     return found;
 }
 
-// What daemons that know nothing of stillness leave out.
+// Reads the fields that daemons without stillness leave out.
 inline void stillness(const json& told, Verdict& found) {
     const auto early = told.find("early");
     if (early != told.end()) {
@@ -409,8 +410,8 @@ inline Message message(const json& told) {
     return all;
 }
 
-// A JSON object without a key twice: readers differ in which of two values holds.
-// Returns a value that is not an object for other text.
+// Returns a JSON object, or a value that is not an object for other text and for a repeated key,
+// of which readers differ.
 inline json parsed(std::string_view payload) {
     const auto opens = [](char c) { return c == '[' || c == '{'; };
     // A byte order mark is passed over by the parser, and a NUL is its end.
@@ -431,7 +432,7 @@ inline json parsed(std::string_view payload) {
     return twice ? json() : told;
 }
 
-// A verdict message, or why it is none: `malformed` or `version`.
+// Returns a verdict message, or why it is not one: `malformed` or `version`.
 inline std::pair<std::optional<Message>, std::string> read(std::string_view payload,
                                                            double max_p_slip) {
     const json told = parsed(payload);
@@ -440,7 +441,7 @@ inline std::pair<std::optional<Message>, std::string> read(std::string_view payl
         if (integer(told, "v") != VERSION) return {std::nullopt, "version"};
         Message found = message(told);
         Verdict& said = found.verdict;
-        // What more likely slips is not stable.
+        // A `stable` with too high a `p_slip` is unknown.
         if (said.decision == Decision::stable && *said.p_slip >= max_p_slip)
             said = said.unknown({"p-slip"});
         return {std::move(found), ""};
@@ -449,7 +450,7 @@ inline std::pair<std::optional<Message>, std::string> read(std::string_view payl
     }
 }
 
-// An outcome as it is sent. Throws `std::invalid_argument`.
+// Returns the message of an outcome. Throws `std::invalid_argument`.
 inline std::string telling(const Verdict& lifted_on, Outcome how, const std::string& object_name) {
     if (lifted_on.boot_id.empty() || lifted_on.grasp.value_or(0) == 0)
         throw std::invalid_argument("nothing was lifted on a verdict that is of no grasp");
@@ -469,7 +470,7 @@ inline std::string telling(const Verdict& lifted_on, Outcome how, const std::str
     return told + ' ' + object_name;
 }
 
-// The answer to an outcome; none if it is not understood.
+// Returns the answer to an outcome; none if it is not understood.
 inline std::optional<OutcomeAnswer> taken(std::string_view payload) {
     const json told = parsed(payload);
     if (!told.is_object()) return std::nullopt;
@@ -485,7 +486,7 @@ inline std::optional<OutcomeAnswer> taken(std::string_view payload) {
     }
 }
 
-// The daemon's clock; none if the answer is not understood.
+// Returns the daemon's clock, ns; none if the answer is not understood.
 inline std::optional<Nanoseconds> told_clock(std::string_view payload) {
     const json told = parsed(payload);
     if (!told.is_object()) return std::nullopt;
@@ -497,22 +498,22 @@ inline std::optional<Nanoseconds> told_clock(std::string_view payload) {
     }
 }
 
-// What the newest message says; no socket and no clock of its own.
+// State of a hand by its newest message; it has neither socket nor clock.
 class Newest {
 public:
     Newest(std::string topic, Nanoseconds max_age_ns, bool same_computer, double max_p_slip = 0.5)
         : topic_(std::move(topic)), max_age_ns_(max_age_ns), same_computer_(same_computer),
           max_p_slip_(max_p_slip) {}
 
-    // Words of each finger in the messages of the last look.
+    // State of each finger in the messages of the last look.
     std::set<std::pair<std::string, FingerState>> passed;
     Counts counts;
     bool may_be_announced = false;  // the lift that the last answer was about
 
-    // For how long no message may come; 0 without one.
+    // Longest time without a message before the grasp is unknown, ns; 0 without a message.
     Nanoseconds silence_ns() const { return message_ ? message_->silence_ns : 0; }
 
-    // What came is not known any more, nor how the clocks differ; repeats stay repeats.
+    // Forget the message and the clocks' difference; still recognise repeats.
     void forget(std::string why) {
         message_.reset();
         best_.reset();
@@ -520,15 +521,15 @@ public:
         why_ = std::move(why);
     }
 
-    // The daemon's clock read `told_ns` at some time after `asked_ns` (own clock).
+    // Note that the daemon's clock read `told_ns` at some time after `asked_ns` (own clock).
     void compare_clocks(Nanoseconds asked_ns, Nanoseconds told_ns) {
         Nanoseconds least_ns = asked_ns - told_ns;
         if (bound_) least_ns = std::max(least_ns, at_least(*bound_, asked_ns));
         bound_ = {least_ns, asked_ns};
     }
 
-    // Take in a message, which came after `empty_ns` and not after `now_ns` (own clock).
-    // Whether it is a new one. A repeated one is not; one that is not understood is.
+    // Take in a message that arrived after `empty_ns` and by `now_ns` (own clock). Returns false
+    // for a repeated message, true for a new one, understood or not.
     bool take(const std::vector<std::string_view>& frames, Nanoseconds empty_ns,
               Nanoseconds now_ns) {
         if (frames.empty() || frames[0] != topic_) return false;
@@ -550,7 +551,7 @@ public:
         return true;
     }
 
-    // What is known at a time (own clock).
+    // Returns the verdict that holds at `now_ns` (own clock).
     Verdict at(Nanoseconds now_ns) const {
         if (!message_) return Verdict{}.unknown({why_});
         const Nanoseconds age_ns = published_ns_ ? now_ns - *published_ns_ : 0;
@@ -561,7 +562,7 @@ public:
         const bool may_have_crept = !bound_ && best_ && best_->first - least_ns_ > DRIFT_MAX_NS;
         const bool is_clock_known = age_ns >= -CLOCK_SLACK_NS && !may_have_crept;
         const bool is_fresh = age_ns <= message_->silence_ns && reading_age_ns <= max_age_ns_;
-        // What a finger feels now is not known by what is old.
+        // An old reading does not show the fingers' present state.
         if (!published_ns_ || !is_clock_known || !is_fresh)
             for (auto& [finger, felt] : said.fingers) felt.reset();
         if (!published_ns_) return said.unknown({"joining"});
@@ -571,14 +572,14 @@ public:
         return if_open(std::move(said));
     }
 
-    // The outcome of a grasp was told: nothing of it is to be lifted again.
+    // Note that the outcome of a grasp was reported, so it must not be lifted again.
     void end(const Key& grasp) {
         ended_.erase(std::remove(ended_.begin(), ended_.end(), grasp), ended_.end());
         ended_.push_back(grasp);
         if (ended_.size() > LIFTS_MAX) ended_.pop_front();
     }
 
-    // An answer; none if it is not understood.
+    // Returns an answer; none if it is not understood.
     std::optional<Verdict> answered(std::string_view payload) {
         auto found = read(payload, max_p_slip_).first;
         may_be_announced = !found || found->verdict.decision == Decision::stable ||
@@ -589,7 +590,7 @@ public:
     }
 
 private:
-    // A verdict, unknown if it is known of a grasp whose outcome was told.
+    // Returns the verdict, as unknown if the outcome of its grasp was reported.
     Verdict if_open(Verdict said) const {
         const bool is_offered = said.decision != Decision::unknown || said.supervised;
         const bool ended = std::find(ended_.begin(), ended_.end(), key(said)) != ended_.end();
@@ -600,7 +601,7 @@ private:
         return std::find(former_.begin(), former_.end(), boot_id) != former_.end();
     }
 
-    // Whether it went out before what is known, of a start that so is not the newest.
+    // Returns true if it was sent before the known message, so its start is not the newest.
     bool is_older(const Message& message) const {
         return same_computer_ && published_ns_ && message.published_ns < *published_ns_;
     }
@@ -626,17 +627,17 @@ private:
         return true;
     }
 
-    // Least difference of the clocks at `now_ns`, ns: they may have drifted since `bound`.
+    // Returns the lower bound of the clocks' difference at `now_ns`, ns, with drift since `bound`.
     static Nanoseconds at_least(const std::pair<Nanoseconds, Nanoseconds>& bound,
                                 Nanoseconds now_ns) {
         return bound.first - std::llrint(static_cast<double>(now_ns - bound.second) * DRIFT);
     }
 
-    // When a message went out, by one's own clock: what it took longer than the fastest is age.
-    // None for the first: it may have been kept for those who come late.
+    // Returns when a message was sent, by the own clock, as if the fastest one took no time. None
+    // for the first one, which may have been kept for late subscribers.
     std::optional<Nanoseconds> by_arrival(Nanoseconds published_ns, Nanoseconds empty_ns,
                                           Nanoseconds now_ns) {
-        if (bound_)  // no earlier, however long it then waited to be read
+        if (bound_)  // the bound holds however long it waited here
             return std::min(published_ns + at_least(*bound_, now_ns), now_ns);
         const std::pair here{now_ns - published_ns, now_ns};
         if (!best_) {
@@ -659,19 +660,19 @@ private:
     bool same_computer_;
     double max_p_slip_;
     std::optional<Message> message_;
-    std::optional<Nanoseconds> published_ns_;  // of the message, by one's own clock, not later
+    std::optional<Nanoseconds> published_ns_;  // latest publication, own clock
     std::string why_ = "no-message";
     std::optional<std::string> boot_id_;
     std::int64_t seq_ = -1;
     std::deque<std::string> former_;
-    std::deque<Key> ended_;  // grasps whose outcome was told, the oldest first
+    std::deque<Key> ended_;  // grasps whose outcome was reported, the oldest first
     std::optional<std::pair<Nanoseconds, Nanoseconds>> best_;  // of the clocks, and when
     Nanoseconds least_ns_ = 0;  // of these differences
-    // What the clocks differ by at least, as the daemon told its own, and when.
+    // Lower bound of the clocks' difference by the daemon's answer, and its time, ns.
     std::optional<std::pair<Nanoseconds, Nanoseconds>> bound_;
 };
 
-// What a call of ZeroMQ returns; a signal interrupts any of them before it has done anything.
+// Returns the result of a ZeroMQ call, which is repeated if a signal interrupts it.
 template <typename Call>
 auto uninterrupted(const Call& call) {
     while (true) {
@@ -683,7 +684,7 @@ auto uninterrupted(const Call& call) {
     }
 }
 
-// The next message, if one waits.
+// Returns the next message; none if none waits.
 inline bool received(zmq::socket_t& socket, std::vector<zmq::message_t>& frames) {
     frames.clear();
     do {
@@ -695,25 +696,25 @@ inline bool received(zmq::socket_t& socket, std::vector<zmq::message_t>& frames)
     return true;
 }
 
-// Something that is said to the daemon, on a socket of its own, until it has answered.
+// A request to the daemon, on its own socket, until it is answered.
 struct Call {
     zmq::socket_t socket;
 
-    // The answer, if it is there; empty if it is none.
+    // Returns the answer; none: not yet; empty: it is not an answer.
     std::optional<std::string> answer() {
         std::vector<zmq::message_t> frames;
         if (!socket || !received(socket, frames)) return std::nullopt;
         return frames.size() == 1 ? frames[0].to_string() : std::string();
     }
 
-    // An answer that is late must not be mistaken for one to the next question.
+    // Close the socket, so that a late answer is not mistaken for one to the next question.
     void hang_up() {
         socket.close();
         socket = zmq::socket_t();
     }
 };
 
-// The sockets.
+// The sockets of a client.
 class Link {
 public:
     explicit Link(const Options& options)
@@ -736,7 +737,7 @@ public:
             [&] { return call.socket.send(zmq::buffer(question), zmq::send_flags::dontwait); });
     }
 
-    // Say that no lift follows what was asked, and hang up.
+    // Report that no lift follows the question, and close the socket.
     void take_back(Call& call) {
         if (!call.socket) return;
         call.socket.set(zmq::sockopt::linger, TAKE_BACK_MS);
@@ -748,7 +749,7 @@ public:
         leaving_.pop_front();
     }
 
-    // Connect again, and forget what waits.
+    // Reconnect, and forget waiting messages.
     void renew() {
         socket_.close();
         socket_ = connected(zmq::socket_type::sub, options_.endpoint);
@@ -774,13 +775,13 @@ private:
         }
         if (kind == zmq::socket_type::sub)
             set(zmq::sockopt::subscribe, "verdict." + options_.hand);
-        else  // graspd knows the client by the name, and each connection by the number after it
+        else  // the name identifies the client, the number after it the connection
             set(zmq::sockopt::routing_id, name_ + std::to_string(++calls_));
         uninterrupted([&] { made.connect(endpoint); });
         return made;
     }
 
-    // 16 bytes that routing ids begin with: random, the first not zero.
+    // Random name, 16 bytes, with which routing ids begin; the first byte is not zero.
     static std::string random_name() {
         std::random_device random;
         std::string name = "g";
@@ -793,7 +794,7 @@ private:
     std::string name_ = random_name();
     std::uint64_t calls_ = 0;
     zmq::socket_t socket_;
-    std::deque<zmq::socket_t> leaving_;  // whose last message is being sent
+    std::deque<zmq::socket_t> leaving_;  // sockets whose last message is being sent
 
 public:
     Call asking, telling, timing;  // closed before the context
@@ -810,7 +811,7 @@ struct Owner {
     }
 };
 
-// Whether the message that is the answer is still to come.
+// Returns true if the newest message is older than the answer.
 inline bool is_behind(const Verdict& newest, const Verdict& answer) {
     return newest.boot_id != answer.boot_id || !newest.seq || *newest.seq < *answer.seq;
 }
@@ -833,15 +834,15 @@ public:
         link_.asking.hang_up();
     }
 
-    // Whether a verdict lets the hand lift.
+    // Returns true if a verdict lets the hand lift.
     bool permits(const Verdict& said) const { return said || (supervised_ && said.supervised); }
 
-    // Whether there is no need to wait.
+    // Returns true if the verdict decides, so that waiting can end.
     bool is_over(const Verdict& said) const {
         return said.decision == Decision::slip || permits(said);
     }
 
-    // The newest message, if it confirms the answer; nothing to lift on otherwise. Asks.
+    // Returns the newest verdict if it confirms the answer, else an unknown one; asks if needed.
     Verdict decided(Verdict newest) {
         newest = if_still(std::move(newest));
         if (!asks_) return newest;
@@ -874,7 +875,7 @@ public:
                                                      : newest.reasons);
     }
 
-    // What was decided; if it is not a lift on a message, also that no answer came.
+    // Returns the decision at the deadline, with `no-answer` if no lift and no answer came.
     Verdict at_the_end(Verdict said) {
         lifts_ = permits(said);
         auto& why = said.reasons;
@@ -885,8 +886,8 @@ public:
     }
 
 private:
-    // A verdict, unknown if it permits a lift before the hand was still for long enough. A lift
-    // under supervision must not be early; any lift needs `still_ms` of stillness.
+    // Returns the verdict, as unknown if it permits a lift but the hand was not still long enough.
+    // A lift under supervision must not be early; any lift needs `still_ms` of stillness.
     Verdict if_still(Verdict said) const {
         if (!permits(said)) return said;
         const bool still = !still_ms_ || (said.still_ms && *said.still_ms >= *still_ms_);
@@ -898,7 +899,7 @@ private:
     bool asks_, supervised_, asked_ = false, heard_ = false;
     bool may_be_announced_ = false, lifts_ = false;
     std::optional<double> still_ms_;
-    std::optional<Verdict> answer_;  // that is to be confirmed
+    std::optional<Verdict> answer_;  // answer to be confirmed
 };
 
 }  // namespace detail
@@ -906,8 +907,8 @@ private:
 // Subscribes to the verdicts of one hand. Use it in one thread.
 class Client {
 public:
-    // Throws `zmq::error_t` for an endpoint that is none, `std::invalid_argument` for an age or a
-    // probability that is none.
+    // Throws `zmq::error_t` for a wrong endpoint, `std::invalid_argument` for an invalid age or
+    // probability.
     explicit Client(const Options& options)
         : newest_("verdict." + options.hand, age_ns(options.max_age_ms),
                   options.same_computer.value_or(detail::is_same_computer(options.endpoint)),
@@ -920,29 +921,29 @@ public:
 
     const Counts& counts() const { return newest_.counts; }
 
-    // Lifts that were allowed before the last one, and of which graspd has no outcome. It cannot
-    // learn from them, and they are in no bound of `risk`; `Options::warn` is told.
+    // Number of lifts, before the last allowed one, of which graspd has no outcome. It cannot
+    // learn from them. With `[risk]` a lift that is never reported counts as a slip.
     std::int64_t unreported() const {
         std::int64_t found = forgotten_;
         for (const auto& [grasp, told] : lifts_) found += !told && grasp != last_;
         return found;
     }
 
-    // The newest verdict; waits at most `wait_s` seconds for a new message.
+    // Returns the newest verdict; waits at most `wait_s` seconds for a new message.
     Verdict verdict(double wait_s = 0.0) {
         return next_verdict(detail::now_ns() + duration_ns(wait_s));
     }
 
-    // Whether the current grasp is stable, known within `deadline_s` seconds from now.
+    // Returns whether the current grasp may be lifted, within `deadline_s` seconds from now.
     //
-    // Waits for a fresh `stable`, or `slip`. With an ask endpoint the daemon is asked, and the
-    // answer and the newest message of the same grasp must both say so; an unknown answer is asked
-    // for again. Whatever else happens until the deadline is a no. Say `supervised` only while a
-    // person watches: then what graspd wants to learn from (in the warm-up, and now and then after
-    // it) may be lifted too if it is not `early`, and the answer says that it is such a lift. With
-    // `still_ms` the hand must have been still for that time too, and a daemon that does not say
-    // so gets a no; without it, what the daemon calls `stable` is enough, also where it is `early`:
-    // its scene allows that. Throws `std::invalid_argument` for a time that is none.
+    // Waits for a fresh `stable` or `slip`. With an ask endpoint it asks the daemon, and the answer
+    // and the newest message of the same grasp must both say `stable`; after an unknown answer it
+    // asks again. Everything else until the deadline is a no. Pass `supervised` only while a person
+    // watches: a grasp from which graspd asks to learn, in the warm-up and sometimes later, may
+    // then be lifted if it is not `early`, and the answer has `supervised`. `still_ms`: time for
+    // which the hand must have been still; a daemon that does not report it gets a no. Without it
+    // `stable` is enough, even if `early`, because its scene allows that. Throws
+    // `std::invalid_argument` for an invalid time.
     LiftAnswer may_i_lift(double deadline_s, bool supervised = false,
                           std::optional<double> still_ms = {}) {
         if (still_ms && !(*still_ms >= 0.0 && *still_ms <= REAL_MAX))
@@ -966,12 +967,12 @@ public:
     // A time in the place of `supervised` would be mistaken for true.
     LiftAnswer may_i_lift(double deadline_s, double still_ms) = delete;
 
-    // The verdict on the next grasp that is surely judged; none if there is none in time.
+    // Returns the verdict on the next grasp once it is judged for sure; none if none is in time.
     //
-    // Waits at most `deadline_s` seconds for a `stable` or a `slip` of a grasp that this method has
-    // not returned before. With `supervised` it also returns what a person who watches may lift. It
-    // never returns what is `early`. It asks nothing: before the lift, ask `may_i_lift`. Throws
-    // `std::invalid_argument` for a time that is none.
+    // Waits at most `deadline_s` seconds for a `stable` or `slip` of a grasp that this method has
+    // not returned before. With `supervised` it also returns grasps to lift while a person watches.
+    // It never returns an `early` verdict. It asks nothing: call `may_i_lift` before the lift.
+    // Throws `std::invalid_argument` for an invalid time.
     std::optional<Verdict> wait_for_grasp(double deadline_s, bool supervised = false) {
         const Nanoseconds due_ns = detail::now_ns() + duration_ns(deadline_s);
         do {
@@ -987,18 +988,17 @@ public:
     }
 
     // Watch over a lift: wait until something slides, at most `timeout_s` seconds.
-    //
-    // It ends at once when a finger says `slide`, when one that touched at first is `free`, and when
-    // another grasp is at hand. It ends too when for `max_age_ms` no reading said that all that
-    // touched at first still do: what is not known may slide. Throws `std::invalid_argument` for a
-    // time that is none.
+    // It ends at once when a finger has the state `slide`, when one that touched at first is
+    // `free`, and when another grasp begins. It also ends when for `max_age_ms` no reading showed
+    // that all fingers that touched at first still do, as something may slide unseen. Throws
+    // `std::invalid_argument` for an invalid time.
     SlideAnswer wait_for_slide(double timeout_s) {
         const Nanoseconds began_ns = detail::now_ns();
         const Nanoseconds due_ns = began_ns + duration_ns(timeout_s);
         Nanoseconds sure_ns = began_ns;
         std::vector<std::string> touched;
         Key grasp;
-        bool is_first = true;  // what came before the first look was before the lift
+        bool is_first = true;  // older messages are from before the lift
         while (true) {
             const Verdict newest = verdict();
             const Nanoseconds now_ns = detail::now_ns();
@@ -1030,14 +1030,13 @@ public:
         }
     }
 
-    // Tell how the lift ended that was made on a verdict, and what was lifted (empty: not told).
-    // Tell `Outcome::not_lifted` if no lift followed a yes: else graspd waits for an outcome.
+    // Report how the lift made on a verdict ended, and the object's name (empty: not known). Report
+    // `Outcome::not_lifted` if no lift followed a yes; otherwise graspd waits for an outcome.
     //
-    // Waits at most `wait_s` seconds: graspd answers once it is written to disk. An answer that
-    // comes later is taken in by later calls; without one, tell it again. Throws
-    // `std::invalid_argument` without an ask endpoint, for a verdict that is of no grasp, and for a
-    // name that is not 1 to 64 letters (ASCII), digits, `_`, `-`, `.`, or begins with one of the
-    // last two.
+    // Waits at most `wait_s` seconds: graspd answers once the outcome is on its disk. Later calls
+    // take in a late answer; without one, report again. Throws `std::invalid_argument` without an
+    // ask endpoint, for a verdict without a grasp, and for a name that is not 1 to 64 letters
+    // (ASCII), digits, `_`, `-`, `.`, or that begins with one of the last two.
     OutcomeAnswer tell(const Verdict& lifted_on, Outcome how,
                        const std::string& object_name = {}, double wait_s = 2.0) {
         const std::string telling = detail::telling(lifted_on, how, object_name);
@@ -1055,10 +1054,10 @@ public:
     }
 
 private:
-    // Whether this is the process that made the client, and not a fork of it.
+    // Returns true in the process that made the client, false in a fork of it.
     bool is_here() const { return link_.get_deleter().is_here(); }
 
-    // The newest verdict; waits for a new message until then at most.
+    // Returns the newest verdict; waits for a new message at most until then.
     Verdict next_verdict(Nanoseconds due_ns) {
         if (!is_here()) return Verdict{}.unknown({"other-process"});
         while (!drain() && wait(due_ns)) {}
@@ -1085,7 +1084,7 @@ private:
 
     using Key = detail::Key;
 
-    // The hand lifts this grasp; what was lifted before is over, and should have been told.
+    // Note that the hand may lift this grasp. The outcome of the lift before is now overdue.
     void allow(const Key& lift) {
         last_ = lift;
         if (std::none_of(lifts_.begin(), lifts_.end(),
@@ -1102,7 +1101,7 @@ private:
                   " lifts were allowed, and their outcome not told");
     }
 
-    // Take in the answer to an outcome, if it is there.
+    // Take in the answer to an outcome, if it has arrived.
     void hear() {
         const auto payload = link_->telling.answer();
         if (!payload) return;
@@ -1135,7 +1134,7 @@ private:
         link_->ask(link_->timing, "clock");
     }
 
-    // Read all that waits, without waiting; whether there was anything new.
+    // Read all waiting messages without blocking; returns true if one was new.
     bool drain() {
         bool anything_new = false;
         const Nanoseconds heard_ns = forget_what_is_old();
@@ -1185,7 +1184,7 @@ private:
         empty_ns_ = heard_ns_ = detail::now_ns();
     }
 
-    // Wait for a message, but not for long; false when it is time to end.
+    // Wait briefly for a message; returns false when the call must end.
     bool wait(Nanoseconds due_ns) {
         const Nanoseconds left_ns = due_ns - detail::now_ns();
         if (left_ns <= 0 || !is_here()) return false;
@@ -1200,8 +1199,8 @@ private:
     std::optional<Nanoseconds> clock_asked_ns_;
     Nanoseconds clock_due_ns_ = 0;
     std::function<void(const std::string&)> warn_;
-    std::deque<std::pair<Key, bool>> lifts_;  // that were allowed, and whether graspd has it
-    Key last_, telling_;                      // of them, and that is being told
+    std::deque<std::pair<Key, bool>> lifts_;  // allowed lifts; true if graspd has the outcome
+    Key last_, telling_;                      // last allowed one, and the one being reported
     Key returned_;                            // the grasp that `wait_for_grasp` returned last
     std::optional<OutcomeAnswer> told_;
     std::int64_t forgotten_ = 0, warn_at_ = 1;
