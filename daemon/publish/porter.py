@@ -289,7 +289,7 @@ class Porter:
         return made
 
     def _watch(self, made: Socket, number: int, events: int = 0) -> None:
-        """Watch `events` of a socket, then let it accept the peers of endpoint `number`."""
+        """Monitor `events` of a socket. Call it before a peer of endpoint `number` can connect."""
         if self._keys_at(number) is not None:
             events |= FAILED
         if events:

@@ -89,7 +89,7 @@ def contradicting(random: Random) -> Iterator[Outcome]:
 
 
 def against_the_margin(random: Random) -> Iterator[Outcome]:
-    """Yield slips of grasps that the network is surest are stable, and the reverse."""
+    """Yield slips of grasps of which the network is surest that they are stable."""
     while True:
         yield -30.0, CLIP * np.eye(INPUTS)[random.integers(INPUTS)], True
 
