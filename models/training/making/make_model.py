@@ -51,7 +51,7 @@ from graspd.models.training.systems.registry import configuration
 
 LIBRARIES = ("numpy", "onnx", "onnxruntime", "onnxscript", "scikit-learn", "skl2onnx", "torch")
 EXTRA_TRAININGS = 2
-"""Number of trainings beside the folds: the last one, and those of the broken-electrode study."""
+"""Number of counted trainings after the folds: the first fold again, and the final model."""
 
 PUBLISHED_DATA = "The data is of one hand and 41 objects, lifted in one way."
 WEAK_POINTS = (
