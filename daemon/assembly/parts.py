@@ -42,7 +42,7 @@ class Parts:
     drivers: list[Driver]
     """All drivers, the tactile one first."""
     boot_id: str | None = None
-    """Id of the daemon's start whose recording is judged; None: this start."""
+    """`boot_id` of the run whose recording is judged again; None: that of this process."""
 
     @property
     def scene(self) -> Scene:

@@ -217,7 +217,7 @@ def _listen(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> lis
 
 
 def _collect(drivers: Sequence[Driver], statistics: ElectrodeStatistics, listen_s: float) -> float:
-    """Feed the statistics for `listen_s`; return their number times the mean period, s."""
+    """Feed the statistics for `listen_s`; return the readings' number times mean period, s."""
     start_s = first_s = last_s = time.monotonic()
     while drivers and time.monotonic() - start_s < listen_s and not drivers[0].exhausted:
         poll = select.poll()

@@ -316,7 +316,7 @@ class _Judge(msgspec.Struct):
 
 @dataclass(slots=True)
 class _Implied:
-    """Header as the messages of a recording imply it."""
+    """Header of a recording that lacks one, computed from its messages."""
 
     fingers: tuple[Finger, ...] = ()
     joints: bool = False

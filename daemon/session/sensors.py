@@ -89,7 +89,7 @@ class SensorWatch(Companion):
             self._look_at(rest)
 
     def _look_at(self, rest: Rest) -> None:
-        """Compare the resting counts with the kept ones."""
+        """Compare resting counts with the saved ones; begin another session if sensors changed."""
         tared = [bool(finger.any()) for finger in rest]
         if not any(tared):
             self._is_first_tare = True

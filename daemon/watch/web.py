@@ -113,7 +113,7 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = PATIENCE_S
 
     def setup(self) -> None:
-        """Keep the backlog of a slow browser small."""
+        """Limit the send buffer, so that a slow browser has a small backlog."""
         self.request.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
         super().setup()
 

@@ -39,7 +39,7 @@ class Row:
     counts: NDArray[np.uint16]
     """Shape (fingers, 24)."""
     faults: NDArray[np.uint8]
-    """Shape (fingers, 24), `ElectrodeFault` bits."""
+    """`ElectrodeFault` bits of each electrode, shape (fingers, 24)."""
     annotation: Annotation
     t_s: float | None
     """Time of the row, s, never lower than before; None for a table."""

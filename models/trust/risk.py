@@ -186,7 +186,7 @@ class Risk:
         return int.from_bytes(digest) / 2.0**64 < self.limits.explore
 
     def take(self, *, stable: bool, slipped: bool, proves: bool) -> None:
-        """Take in an outcome. `stable`: the grasp had been called so.
+        """Take in an outcome. `stable`: True if the grasp had been called `stable`.
 
         `proves`: False for lifts with former sensors, which do not count for the warm-up.
         """
