@@ -67,7 +67,7 @@ def test_over_tcp_as_from_another_computer(tmp_path: Path) -> None:
         assert (graspd.counts.lost, graspd.counts.malformed) == (0, 0)
 
 
-def test_soon_or_sure_is_for_who_lifts_to_choose(lift_gate: Path, tmp_path: Path) -> None:
+def test_a_caller_may_ask_for_early_or_settled_verdicts(lift_gate: Path, tmp_path: Path) -> None:
     with (
         Daemon(tmp_path, "[gate]\nearly = true\n", whole_grasps=True) as daemon,
         Client(daemon.endpoint) as graspd,
@@ -85,7 +85,7 @@ def test_soon_or_sure_is_for_who_lifts_to_choose(lift_gate: Path, tmp_path: Path
         wait_until(lambda: "\nlift after" in asked(lift_gate, *words).stdout)
 
 
-def test_how_a_lift_ended_is_told_to_all_who_listen(lift_gate: Path, tmp_path: Path) -> None:
+def test_the_outcome_of_a_lift_is_published(lift_gate: Path, tmp_path: Path) -> None:
     with (
         Daemon(tmp_path, whole_grasps=True) as daemon,
         Client(daemon.endpoint, ask_endpoint=daemon.ask_endpoint) as graspd,
@@ -124,7 +124,7 @@ def test_how_a_lift_ended_is_told_to_all_who_listen(lift_gate: Path, tmp_path: P
     assert (told.boot_id, told.grasp) == (lifted_on.boot_id, lifted_on.grasp)
 
 
-def test_the_program_that_asked_tells_how_it_ended(lift_gate: Path, tmp_path: Path) -> None:
+def test_the_asking_program_reports_the_outcome(lift_gate: Path, tmp_path: Path) -> None:
     with Daemon(tmp_path, whole_grasps=True) as daemon:
         words = "--supervised", daemon.endpoint, 1.0, daemon.ask_endpoint, "mug"
         wait_until(lambda: asked(lift_gate, *words, typed="slipped").stdout.endswith("taken\n"))
@@ -142,7 +142,7 @@ def test_a_killed_daemon_is_unknown_until_its_next_message(tmp_path: Path) -> No
         assert graspd.verdict().boot_id != former  # nothing of before has come back
 
 
-def test_in_cpp_stopped_restarted_and_slow_it_says_so(lift_gate: Path, tmp_path: Path) -> None:
+def test_the_cpp_client_reports_stalls_restarts_and_losses(lift_gate: Path, tmp_path: Path) -> None:
     with Daemon(tmp_path) as daemon, watching(lift_gate, daemon.endpoint) as watch:
         former = boot_id(line_with(watch, "stable", "slip"))
         daemon.send(signal.SIGSTOP)
@@ -163,7 +163,7 @@ def test_in_cpp_stopped_restarted_and_slow_it_says_so(lift_gate: Path, tmp_path:
             pass
 
 
-def test_only_who_has_keys_is_told(lift_gate: Path, tmp_path: Path) -> None:
+def test_only_clients_with_keys_get_verdicts(lift_gate: Path, tmp_path: Path) -> None:
     public, secret = make(tmp_path, "daemon")
     own_public, own_secret = make(tmp_path / "clients", "lab")
     endpoint = free_endpoint()
@@ -213,6 +213,6 @@ def test_a_wrong_command_line_never_means_yes(lift_gate: Path, words: list[str])
     assert "lift_gate" in result.stdout + result.stderr
 
 
-def test_an_endpoint_that_is_none_leaves_nothing_behind() -> None:
+def test_a_refused_endpoint_leaves_no_socket_open() -> None:
     with pytest.raises(zmq.ZMQError):
         Client("nowhere")

@@ -20,7 +20,7 @@ def made(folder: Path, *, ask: bool = True) -> AsyncClient:
     return AsyncClient(f"ipc://{folder}/out", ask_endpoint=f"ipc://{folder}/ask" if ask else None)
 
 
-def test_it_takes_what_the_client_takes() -> None:
+def test_the_asyncio_client_has_the_clients_calls_and_arguments() -> None:
     for name, call in vars(Client).items():
         if inspect.isfunction(call) and not name.startswith("_"):
             other = inspect.signature(getattr(AsyncClient, name))
@@ -28,7 +28,7 @@ def test_it_takes_what_the_client_takes() -> None:
     assert inspect.signature(Client) == inspect.signature(AsyncClient)
 
 
-def test_a_lift_is_allowed_and_told_once(tmp_path: Path) -> None:
+def test_a_lift_is_allowed_and_reported_once(tmp_path: Path) -> None:
     async def lifts() -> None:
         async with made(tmp_path) as graspd:
             answer = await graspd.may_i_lift(HOURS_S)
@@ -58,7 +58,7 @@ def test_without_a_daemon_the_answer_comes_in_time(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("same_computer", [True, False])
-def test_it_waits_without_looking_again_and_again(
+def test_the_asyncio_client_waits_without_polling(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, same_computer: bool
 ) -> None:
     looks: list[float | None] = []

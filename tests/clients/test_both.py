@@ -75,7 +75,7 @@ CASES = ANSWERS | SUPERVISED | STILL_FOR
 
 
 @pytest.mark.parametrize(("published", "answer", "wants", "word"), CASES.values(), ids=CASES)
-def test_only_what_fits_allows_a_lift(
+def test_only_a_fitting_verdict_and_answer_allow_a_lift(
     connect: Connect,
     tmp_path: Path,
     published: Fields,
@@ -105,7 +105,7 @@ def test_only_what_fits_allows_a_lift(
         ),
     ],
 )
-def test_a_no_says_why(
+def test_a_refused_lift_has_its_reasons(
     connect: Connect,
     tmp_path: Path,
     published: Fields,
@@ -132,7 +132,7 @@ def test_a_stillness_that_is_not_a_time_is_refused(
     [(told(), "stable", True), (told(), "unknown", False), (told(grasp=2), "stable", False)],
     ids=["yes", "no", "of another grasp"],
 )
-def test_a_no_takes_the_lift_back(
+def test_a_refusal_takes_back_the_lift_before(
     connect: Connect, tmp_path: Path, answer: Answer, outcome: str, may: bool
 ) -> None:
     with false_daemon(tmp_path, answer, outcome) as heard:

@@ -27,7 +27,7 @@ def stream(*outcomes: str) -> list[tuple[int, list[bytes]]]:
         (["unknown"], "unknown", ("silent",), 0.3),
     ],
 )
-def test_it_answers_once_it_is_known_or_time_is_over(
+def test_may_i_lift_answers_by_its_deadline_at_the_latest(
     outcomes: list[str], decision: str, reasons: tuple[str, ...], waited_s: float
 ) -> None:
     with client(World(stream(*outcomes))) as graspd:
@@ -49,7 +49,7 @@ NO_TIMES = [-1.0, float("nan"), float("inf"), 1e300, 10**400, "half", None, True
 
 
 @pytest.mark.parametrize("seconds", [*NO_TIMES, 1.1e9])
-def test_a_time_that_is_none_is_refused(seconds: Any) -> None:  # noqa: ANN401
+def test_a_waiting_time_that_is_not_seconds_is_refused(seconds: Any) -> None:  # noqa: ANN401
     with client(World([])) as graspd:
         for call, name in (
             (graspd.verdict, "wait_s"),
@@ -62,7 +62,7 @@ def test_a_time_that_is_none_is_refused(seconds: Any) -> None:  # noqa: ANN401
 
 
 @pytest.mark.parametrize("max_age_ms", [*NO_TIMES, 0.0, 1.1e12])
-def test_an_age_that_is_none_is_refused(max_age_ms: Any) -> None:  # noqa: ANN401
+def test_an_age_limit_that_is_not_milliseconds_is_refused(max_age_ms: Any) -> None:  # noqa: ANN401
     with pytest.raises(ValueError, match="max_age_ms"):
         Client("ipc:///nowhere", max_age_ms=max_age_ms)
 
@@ -132,7 +132,7 @@ def test_an_outcome_that_waits_for_the_disk_blocks_no_lift() -> None:
     [("held", "stable"), ("stable", "stable"), (Outcome.HELD, "stable"), ("slipped", "slip"),
      ("slip", "slip"), (Outcome.SLIPPED, "slip")],
 )  # fmt: skip
-def test_an_outcome_is_told_by_its_name(how: str | Outcome, told: str) -> None:
+def test_an_outcome_may_be_given_by_name(how: str | Outcome, told: str) -> None:
     world = World(stream("stable"))
     with client(world, ask=True) as graspd:
         graspd.tell(Verdict(Decision.STABLE, grasp=1, boot_id="a"), how, wait_s=0.0)
@@ -140,7 +140,7 @@ def test_an_outcome_is_told_by_its_name(how: str | Outcome, told: str) -> None:
 
 
 @pytest.mark.parametrize("nothing", [True, False, None, 0, "", "Slip", "unknown", "true"])
-def test_other_values_than_outcomes_are_not_told(nothing: object) -> None:
+def test_a_value_that_is_not_an_outcome_is_refused(nothing: object) -> None:
     world = World(stream("stable"))
     with client(world, ask=True) as graspd, pytest.raises(ValueError, match="Outcome"):
         graspd.tell(Verdict(Decision.STABLE, grasp=1, boot_id="a"), nothing)  # type: ignore[arg-type]
@@ -168,7 +168,7 @@ def test_python_trusts_nothing_from_before_a_sleep() -> None:
     assert world.renewed == 1
 
 
-def test_a_flood_does_not_hold_it_up() -> None:
+def test_a_flood_of_messages_does_not_delay_the_client() -> None:
     world = World([(START_NS, [b"verdict.right"])] * 1500)
     with client(world) as graspd:
         assert graspd.verdict().reasons == ("behind",)

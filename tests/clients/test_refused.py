@@ -76,25 +76,25 @@ def told(cpp: Probe | None, messages: list[list[bytes]], ended: Grasps = ()) -> 
 
 
 @pytest.mark.parametrize("case", CASES, ids=[case["name"] for case in CASES])
-def test_no_refused_case_is_lifted_on(cpp: Probe | None, case: dict[str, Any]) -> None:
+def test_no_bad_message_or_answer_allows_a_lift(cpp: Probe | None, case: dict[str, Any]) -> None:
     found = told(cpp, came(case, START_NS), case.get("told", ()))
     assert not found
     assert not found.supervised
 
 
-def test_what_the_cases_begin_with_is_lifted_on(cpp: Probe | None) -> None:
+def test_the_undamaged_message_allows_a_lift(cpp: Probe | None) -> None:
     assert told(cpp, [PADDED])
     assert told(cpp, [PADDED], [("a", 2), ("b", 1)]), "other grasps were told"
 
 
-def test_told_grasps_are_remembered_in_bounded_memory(cpp: Probe | None) -> None:
+def test_grasps_with_an_outcome_take_bounded_memory(cpp: Probe | None) -> None:
     many = [("a", 1), *(("a", grasp) for grasp in range(2, 258))]
     assert told(cpp, [PADDED], many), "the 257th before"
     assert not told(cpp, [PADDED], many[:-1])
     assert not told(cpp, [PADDED], [*many, ("a", 1)])
 
 
-def test_a_client_believes_a_higher_threshold_only_if_told() -> None:
+def test_a_client_needs_its_option_for_a_higher_threshold() -> None:
     unsure = [TOPIC, json.dumps(well(START_NS) | {"p_slip": 0.6}).encode()]
     for most, reasons in ((0.5, ("p-slip",)), (0.7, ())):
         newest = Newest(TOPIC, MAX_AGE_NS, True, most)

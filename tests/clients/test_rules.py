@@ -53,7 +53,7 @@ def test_noise_is_counted_and_never_stable(cpp: Probe | None, payload: bytes) ->
 
 @many
 @given(events(), st.booleans(), st.sampled_from([0, 5, 77_000]))
-def test_both_clients_say_the_same(
+def test_both_clients_judge_random_messages_alike(
     cpp: Probe | None, sequence: Sequence[Event], same_computer: bool, ahead_ms: int
 ) -> None:
     rules = Rules(cpp, same_computer)
@@ -72,7 +72,7 @@ def said(cpp: Probe | None, message: dict[str, Any]) -> Verdict:
     return rules.at()
 
 
-def test_what_a_verdict_rests_on_is_told(cpp: Probe | None) -> None:
+def test_a_verdict_has_risk_motion_and_finger_words(cpp: Probe | None) -> None:
     found = said(cpp, verdict(0, START_NS, **ADDED))
     assert found
     assert (found.p_slip, found.p_slip_model, found.outcomes) == (0.125, 0.3, 57)
@@ -174,7 +174,7 @@ def test_messages_of_a_rebooted_computer_count_again(cpp: Probe | None) -> None:
 
 @many
 @given(st.lists(st.tuples(st.integers(0, 300), st.integers(0, 300)), max_size=40), DRIFTS)
-def test_where_the_daemon_tells_its_clock_no_delay_is_hidden(
+def test_with_the_daemons_clock_no_delay_is_hidden(
     cpp: Probe | None, delays_ms: list[tuple[int, int]], drift: float
 ) -> None:
     """The delay of each message, and of each question before it, from the first message on."""
@@ -193,7 +193,7 @@ def test_where_the_daemon_tells_its_clock_no_delay_is_hidden(
             pytest.fail(f"late by {delay_ms} ms, asked for {asking_ms} ms: {found}")
 
 
-def test_a_clock_that_was_told_makes_up_for_any_drift(cpp: Probe | None) -> None:
+def test_a_clock_comparison_corrects_any_drift(cpp: Probe | None) -> None:
     rules = Rules(cpp, False)
     for seq in range(200):  # to 100 ms
         now_ns = START_NS + seq * 1000 * MS
@@ -203,7 +203,7 @@ def test_a_clock_that_was_told_makes_up_for_any_drift(cpp: Probe | None) -> None
         assert seq < 1 or rules.at(now_ns)
 
 
-def test_a_clock_that_was_not_told_may_drift_little(cpp: Probe | None) -> None:
+def test_without_a_clock_comparison_little_drift_is_allowed(cpp: Probe | None) -> None:
     rules, unknown = Rules(cpp, False), []
     for seq, delay_us in enumerate([0, *range(0, 30_000, 900), 19_000]):
         sent_ns = START_NS + seq * 1000 * MS
@@ -215,7 +215,7 @@ def test_a_clock_that_was_not_told_may_drift_little(cpp: Probe | None) -> None:
 
 @pytest.mark.parametrize("first", ["clock", "message"])
 @pytest.mark.parametrize("between_ms", [50, 150, 700])
-def test_with_a_clock_that_was_told_rare_looks_age_nothing(
+def test_with_a_known_clock_reading_rarely_ages_no_message(
     cpp: Probe | None, first: str, between_ms: int
 ) -> None:
     """Messages wait to be read: the queue was last empty at the look before."""
@@ -233,7 +233,7 @@ def test_with_a_clock_that_was_told_rare_looks_age_nothing(
         assert found.age_ms == pytest.approx(2.0 + 1e-3 * between_ms * seq, abs=0.1)
 
 
-def test_what_is_forgotten_comes_back_only_with_a_newer_message() -> None:
+def test_after_forgetting_only_a_newer_message_counts() -> None:
     newest = Newest(TOPIC, MAX_AGE_NS, False)
     for seq in range(3):
         newest.take(frames(verdict(seq, OFFSET_NS)), START_NS, START_NS)
@@ -245,7 +245,7 @@ def test_what_is_forgotten_comes_back_only_with_a_newer_message() -> None:
     assert newest.at(START_NS).reasons == ("joining",)  # how the clocks differ is not known now
 
 
-def test_messages_that_waited_unread_have_no_time_of_arrival(cpp: Probe | None) -> None:
+def test_messages_that_waited_unread_are_silence(cpp: Probe | None) -> None:
     rules = Rules(cpp, False)
     now_ns = START_NS + 3000 * MS
     for seq in range(50):  # came in the first half second, read after three

@@ -72,7 +72,7 @@ ENDS: dict[str, tuple[list[tuple[int, list[bytes]]], int, tuple[str, ...]]] = {
 
 
 @pytest.mark.parametrize(("sent", "after_ms", "sliding"), ENDS.values(), ids=ENDS)
-def test_what_slides_or_is_not_known_stops_the_lift(
+def test_a_slide_or_missing_finger_words_stop_the_lift(
     sent: list[tuple[int, list[bytes]]], after_ms: int, sliding: tuple[str, ...]
 ) -> None:
     answer = watched(sent)
@@ -81,7 +81,7 @@ def test_what_slides_or_is_not_known_stops_the_lift(
     assert answer.waited_s == pytest.approx(after_ms / 1e3, abs=0.012)
 
 
-def test_words_of_an_old_reading_are_not_told() -> None:
+def test_an_old_verdict_has_no_finger_words() -> None:
     with client(World(lift(HELD, age_ms=101.0))) as graspd:
         assert graspd.verdict().fingers == {"ff": None, "th": None}
     with client(World(lift(HELD, age_ms=90.0))) as graspd:

@@ -68,7 +68,7 @@ def test_an_outcome_needs_a_grasp_an_endpoint_and_a_client(tmp_path: Path) -> No
         graspd.tell(lifted_on, Outcome.SLIPPED)
 
 
-def test_a_told_grasp_is_offered_no_more(connect: Connect, tmp_path: Path) -> None:
+def test_a_grasp_with_an_outcome_is_not_offered_again(connect: Connect, tmp_path: Path) -> None:
     with false_daemon(tmp_path):
         graspd = connect(tmp_path)
         assert graspd.tell(graspd.lift(LONG_S).grasp, "slip") == ""
@@ -96,7 +96,7 @@ def test_an_outcome_not_kept_stays_unreported(connect: Connect, tmp_path: Path) 
         assert graspd.unreported > 0
 
 
-def test_lifts_never_told_are_counted_and_warned_of(
+def test_lifts_without_an_outcome_are_counted_and_warned_of(
     connect: Connect, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     lifted: dict[Grasp, bool] = {}

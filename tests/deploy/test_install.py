@@ -225,7 +225,7 @@ def test_a_prefix_where_others_may_write_is_refused(
     assert why in done.stderr
 
 
-def test_it_works_by_itself_where_no_systemd_runs(tmp_path: Path, wheels: Path) -> None:
+def test_the_installer_works_where_no_systemd_runs(tmp_path: Path, wheels: Path) -> None:
     (tmp_path / "copy").mkdir()
     if os.geteuid() != 0 or in_a_chroot(tmp_path / "copy", ":").returncode != 0:
         pytest.skip("only root can make a chroot of this computer's files, and not everywhere")
@@ -276,7 +276,7 @@ def test_it_works_by_itself_where_no_systemd_runs(tmp_path: Path, wheels: Path) 
     assert content(tmp_path) == {}
 
 
-def test_what_was_installed_where_others_may_write_can_be_removed(staged: Path) -> None:
+def test_an_installation_in_a_writable_folder_can_be_removed(staged: Path) -> None:
     (staged / "opt").chmod(0o777)
     assert installer("--root", staged, "--uninstall").returncode == 0
     assert set(content(staged)) == {"/etc/graspd/right.toml"}

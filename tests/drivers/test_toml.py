@@ -68,7 +68,7 @@ def test_no_string_or_comment_hides_what_nests(before: str) -> None:
 
 
 @given(st.text("ab.[]{}=\"'#\\\n ,1", max_size=60))
-def test_what_is_read_is_what_tomllib_reads(text: str) -> None:
+def test_accepted_toml_is_parsed_as_by_tomllib(text: str) -> None:
     try:
         wanted = tomllib.loads(text)
     except ValueError:

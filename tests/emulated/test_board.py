@@ -27,9 +27,7 @@ def blinking(half_ms: int, found: list[tuple[bool, int]]) -> bool:
     return len(found) > 1 and all(length == pytest.approx(half_ms) for _, length in found)
 
 
-def test_the_light_tells_idle_sweeping_and_a_missing_sensor_apart(
-    image: Image, board: Board
-) -> None:
+def test_the_light_shows_idle_sweeping_and_a_missing_sensor(image: Image, board: Board) -> None:
     board.power(image())
     board.hello()
     assert blinking(500, turns(board, 2500)), "waits for START"

@@ -113,7 +113,7 @@ def run(
         )
 
 
-def test_the_board_is_what_it_was_built_for(run: Run) -> None:
+def test_the_emulated_board_reports_its_build_options(run: Run) -> None:
     sensors = run.setting.sensors
     assert run.state["sys_hz"] == run.setting.clock_mhz * 1_000_000
     assert (run.state["spi_mode"], run.state["spi_bits"]) == (0, 8)

@@ -164,7 +164,7 @@ def test_trees_take_the_models_input_alone() -> None:
         onnx_file.check(model.SerializeToString())
 
 
-def test_a_second_piece_of_the_graph_is_looked_at_too() -> None:
+def test_every_piece_of_a_split_graph_is_checked() -> None:
     """Readers of this format put the pieces of a message together."""
     model, more = small(), onnx.ModelProto()
     more.graph.node.add().op_type = "Scan"
@@ -174,7 +174,7 @@ def test_a_second_piece_of_the_graph_is_looked_at_too() -> None:
         onnx_file.check(content)
 
 
-def test_a_location_of_more_bits_than_there_are_is_one() -> None:
+def test_a_data_location_beyond_32_bits_is_refused() -> None:
     """The readers of others keep the lowest 32 bits."""
     location = bytes([14 << 3]) + b"\x81\x80\x80\x80\x10"  # 2**32 + 1
     tensor = b"\x42\x01w" + location
@@ -190,7 +190,7 @@ def test_other_bytes_than_a_message_are_refused() -> None:
             onnx_file.check(content)
 
 
-def test_damage_raises_nothing_else_and_gets_nothing_by() -> None:
+def test_a_damaged_file_is_refused_without_another_error() -> None:
     whole = small().SerializeToString()
     seeds = random.Random(SEED)
     passed = 0

@@ -202,7 +202,7 @@ def giant(folder: Path, side: int) -> Path:
     return path
 
 
-def test_one_that_takes_too_long_or_much_memory_is_refused(
+def test_a_model_of_too_much_time_or_memory_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(ModelError, match=r"Failed to allocate|no answer within|takes more than"):

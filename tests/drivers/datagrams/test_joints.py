@@ -74,7 +74,7 @@ IMPOSSIBLE = ["NaN", "1e999", "true", "null", '"0.5"', "3.4908", "-3.4908", "1" 
         ('"elbow": 0.1, "FFJ3": 0.5', {"FFJ3": 0.5}, {"unknown_names": 1}),
     ],
 )
-def test_what_is_not_an_angle_costs_no_other(
+def test_a_value_that_is_not_an_angle_costs_no_other(
     joints: str, angles: dict[str, float], counted: dict[str, int]
 ) -> None:
     found, counters = parse(f'{{"v": 3, "joints": {{{joints}}}, "note": [1, {{}}]}}')

@@ -162,7 +162,9 @@ def test_a_finger_without_a_name_is_left_out_and_counted() -> None:
     ],
     ids=["by number", "by time", "time stands", "number stands", "in turns", "a new start"],
 )
-def test_what_is_not_new_is_dropped(stamps: list[dict[str, Any]], taken: list[int]) -> None:
+def test_a_message_that_is_not_newer_is_dropped(
+    stamps: list[dict[str, Any]], taken: list[int]
+) -> None:
     readings, counters = received(*[
         message({"ff": [1000 + place] * 24}, **stamp) for place, stamp in enumerate(stamps)
     ])  # fmt: skip

@@ -205,7 +205,7 @@ def asc(times_ns: Sequence[int]) -> str:
 
 @pytest.mark.parametrize("written", [shown, asc])
 @pytest.mark.parametrize("is_step", [True, False])
-def test_times_since_the_frame_before_are_told_from_others(
+def test_times_since_the_last_frame_are_recognised(
     tmp_path: Path, is_step: bool, written: Callable[[Sequence[int]], str]
 ) -> None:
     times_ns = [at * STEP_NS + at % 3 * 90_000 for at in range(24 * 9)]

@@ -195,7 +195,9 @@ def test_a_row_with_an_electrode_is_not_a_header(content: bytes) -> None:
         (lambda f, n: f"{f}_e{n}" if f != "th" else f"x{n}", "the file has the fingers ff, mf"),
     ],
 )
-def test_an_unknown_header_is_answered(name: Callable[[str, int], str], said: str) -> None:
+def test_an_unknown_column_name_is_refused_with_a_remedy(
+    name: Callable[[str, int], str], said: str
+) -> None:
     assert said in refusal(renamed(name))
 
 

@@ -124,7 +124,7 @@ def test_a_bridge_that_changes_its_sampling_is_greeted_again() -> None:
     assert conversation.link.reason == "the bridge changed what it samples"
 
 
-def test_of_pings_without_an_answer_eight_are_remembered() -> None:
+def test_the_last_eight_unanswered_pings_are_remembered() -> None:
     conversation, now_ns = greeted(hello(0, period_ms=1000)), T0
     said(conversation, T0)
     for _ in range(8):
@@ -161,7 +161,7 @@ def test_sensors_that_are_absent_twice_or_misread_are_a_fault(
     assert conversation.describe()["spi errors"] == errors
 
 
-def test_people_are_told_what_is_known() -> None:
+def test_the_link_description_shows_board_and_sensors() -> None:
     conversation = opened()
     assert words_of(conversation) == {"port": "port", "link": "greeting"}
     serials = ("BTSP-1", "", "BTSP-3")
@@ -183,7 +183,7 @@ def test_people_are_told_what_is_known() -> None:
     assert words_of(conversation) == {"port": "port", **about, **lost}
 
 
-def test_people_are_told_how_the_bridge_keeps_time() -> None:
+def test_the_link_description_shows_the_bridges_clock() -> None:
     conversation = greeted(hello(0, period_ms=500))
     said(conversation, T0 + S)  # a PING, answered after 1 ms by a clock that is 100 ppm fast
     hear(conversation, hello(43, 1_000_100, period_ms=500), T0 + S + MS)
@@ -205,7 +205,7 @@ def test_people_are_told_how_the_bridge_keeps_time() -> None:
     ("firmware", "newer"),
     [(FIRMWARE - 1, "0.2"), (FIRMWARE, None), (FIRMWARE + 1, None)],
 )
-def test_people_are_told_of_newer_firmware_only(firmware: int, newer: str | None) -> None:
+def test_the_link_description_names_newer_firmware_only(firmware: int, newer: str | None) -> None:
     conversation = greeted(dataclasses.replace(hello(0), firmware=firmware))
     fact = None if newer is None else Fact(newer, DeviceFault.OLD_FIRMWARE)
     assert conversation.describe().get("newer firmware") == fact
@@ -297,7 +297,7 @@ def test_a_bridge_of_changing_sensors_is_given_up() -> None:
         (MISREAD, OTHERS, OTHERS),  # exchanged, and misread once more
     ],
 )
-def test_another_serial_number_stops_readings_until_it_is_told_again(
+def test_changed_serial_numbers_stop_readings_until_two_hellos_agree(
     second: tuple[str, ...], third: tuple[str, ...] | None, serials: tuple[str, ...]
 ) -> None:
     conversation = opened()

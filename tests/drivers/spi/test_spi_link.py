@@ -37,7 +37,7 @@ def rig() -> Iterator[Rig]:
 
 
 @pytest.mark.parametrize("port", ["nonsense://1", "socket://here", "rfc2217://here:70000"])
-def test_a_port_that_can_never_be_is_refused(port: str) -> None:
+def test_a_port_name_that_cannot_exist_is_refused(port: str) -> None:
     with pytest.raises(ValueError, match=f"^port {port}: "):
         SpiBridgeDriver(port, FINGERS)
     for possible in ("/dev/absent", "loop://", "socket://here:5", "hwgrep://absent"):
@@ -97,7 +97,7 @@ def test_sweeps_that_waited_while_the_host_slept_are_not_silence(rig: Rig) -> No
     assert ages_ms[0] - ages_ms[-1] == pytest.approx(490, abs=0.5)
 
 
-def test_a_port_that_another_program_has_is_said(rig: Rig) -> None:
+def test_a_port_in_use_is_named_as_the_cause(rig: Rig) -> None:
     rig.greet()
     with SpiBridgeDriver(rig.bridge.port, FINGERS) as second:
         assert second.conversation.link.reason == f"{rig.bridge.port}: another program has it open"
@@ -318,7 +318,7 @@ def test_why_a_port_cannot_be_opened_is_one_short_line(
         SerialLine("port", 9600).open()
 
 
-def test_who_taps_a_line_gets_all_that_comes_and_goes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_tap_of_a_line_gets_bytes_of_both_directions(monkeypatch: pytest.MonkeyPatch) -> None:
     tapped: list[tuple[LineEvent, bytes]] = []
     line = opened(monkeypatch, Port(b"in"))
     line.tap = lambda event, data: tapped.append((event, data))

@@ -26,7 +26,7 @@ def test_a_margin_beyond_thirty_says_no_more_than_thirty() -> None:
 
 
 @pytest.mark.parametrize("inputs", [0, 1, 6])
-def test_it_is_the_dense_filter_in_long_double(inputs: int) -> None:
+def test_the_learner_equals_a_dense_filter_in_long_double(inputs: int) -> None:
     stream = [(margin, x[:inputs], y) for margin, x, y in lifts(40, inputs or 1)]
     learner = Learner(inputs)
     reference = Reference([m for m, *_ in stream], np.array([x for _, x, _ in stream]))
@@ -66,7 +66,7 @@ KINDS: dict[str, Callable[[np.random.Generator, int], tuple[float, ArrayLike, bo
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_whatever_it_is_told_it_stays_bounded_and_positive_definite(kind: str) -> None:
+def test_any_outcomes_leave_a_bounded_positive_definite_covariance(kind: str) -> None:
     random, number = np.random.default_rng(0), 2500 if kind == "all in turns" else 500
     learner = Learner(ONE_FINGER)
     weights_prior = [0.5**2, 0.5**2] + [0.2**2] * ONE_FINGER

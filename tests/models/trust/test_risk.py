@@ -27,7 +27,7 @@ def lift(rule: Risk, log_odds: float, slips: Callable[[bool], bool]) -> bool:
 
 
 @pytest.mark.parametrize("alpha", ALPHAS)
-def test_an_adversary_that_slips_when_told_stable_is_silenced(alpha: float) -> None:
+def test_slips_of_every_stable_lift_end_stable(alpha: float) -> None:
     rule = risk(alpha)
     for _ in range(1000):
         lift(rule, -1e9, lambda stable: stable)
@@ -67,7 +67,7 @@ def test_the_threshold_rises_with_outcomes_and_falls_with_the_budget() -> None:
     assert probability() == pytest.approx(1.0 / (1.0 + 85.0 / 15.0 * 4.05 / 3.1))
 
 
-def test_stable_needs_a_number_up_to_the_threshold() -> None:
+def test_only_a_number_up_to_the_threshold_is_allowed() -> None:
     rule = risk(0.05)
     assert rule.decide(rule.threshold) is Permission.ALLOWED
     assert rule.decide(math.nextafter(rule.threshold, 0.0)) is Permission.WITHHELD

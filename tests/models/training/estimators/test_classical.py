@@ -20,7 +20,7 @@ COUNTS, SLIPPED = separable_counts(120)
 VECTORS = VectorBuilder(3).build_batch(COUNTS)[0]
 
 
-def test_a_forest_of_one_mind_has_a_finite_margin() -> None:
+def test_a_unanimous_forest_has_a_finite_margin() -> None:
     """All trees agree: 0.999 and 0.001, log-odds 6.9068."""
     fitted = fit_classical(ForestConfig(11, None), VECTORS, SLIPPED, seed=0)
     assert np.abs(fitted.margins(VECTORS)).max() == pytest.approx(6.90675, abs=1e-4)

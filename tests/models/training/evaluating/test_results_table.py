@@ -178,7 +178,7 @@ def test_every_published_row_is_there_even_if_nothing_was_run() -> None:
         assert [f"`{system}`", f"`{protocol}`", figure, paper, "-", "-"] in shown
 
 
-def test_sessions_are_told_by_the_number_of_grasps() -> None:
+def test_the_results_table_names_sessions_by_their_grasps() -> None:
     ours = figures_of("svm-session", "session", wrong=0.2)
     assert ours.headline == "n50"
     assert list(by_age(ours.of_variant("running"))) == [0, 5, 10, 20]
