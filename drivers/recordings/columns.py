@@ -113,6 +113,8 @@ class Columns:
     """Fingers that the file has, asked for or not."""
     finger: tuple[int, str] | None
     """Place and name of a column that may say of which finger a row is, of electrodes of one."""
+    names_finger: bool
+    """True if the names of the electrodes have a finger, as `ff_e1`."""
 
     @classmethod
     def of(cls, path: Path, names: Sequence[str], fingers: Sequence[str], line: int) -> Columns:
@@ -153,6 +155,7 @@ class Columns:
             ignored=tuple(name for place, name in enumerate(names) if place not in known),
             fingers=every,
             finger=_finger_column(names) if len(every) == 1 else None,
+            names_finger=not any(map(SCHEMES["E1"].fullmatch, plain)),
         )
 
 
@@ -193,11 +196,8 @@ def _electrodes(
                 number = int(match["number"])
                 _refuse_twice(path, names, line, numbers.get(number), place)
                 numbers[number] = place
-        if not found.keys() <= _PLACES.keys() and (column := _finger_column(names)):
-            problem = f"{example} and so on name no finger, but {column[1]} may: {ONE_ROW}"
-            raise RecordingError(path, problem, line=line)
         if found:
-            return _whole(path, example, found, fingers, line)
+            return _whole(path, example, found, fingers, line, _finger_column(names))
     if are_numbers(names):
         raise RecordingError(
             path, "has numbers in place of names: the header is missing", line=line
@@ -221,6 +221,7 @@ def _whole(
     found: dict[str, dict[int, int]],
     fingers: Sequence[str],
     line: int,
+    finger_column: tuple[int, str] | None,
 ) -> dict[str, dict[int, int]]:
     """Return the electrodes by number from 0; raise if a requested finger lacks some."""
     base = min(1, *(min(numbers) for numbers in found.values()))
@@ -232,6 +233,9 @@ def _whole(
                 f"sensor than the BioTac SP with {ELECTRODES}; no model of graspd judges it"
             )
             raise RecordingError(path, problem, line=line)
+    if not is_named and len(found) == 1 and finger_column is not None:
+        problem = f"{example} and so on name no finger, but {finger_column[1]} may: {ONE_ROW}"
+        raise RecordingError(path, problem, line=line)
     if not is_named:
         asked = f"{len(fingers)} are" if fingers else "none is"
         problem = f"{example} and so on name no finger, and {asked} asked for: name it, as ff_e1"

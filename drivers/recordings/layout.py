@@ -231,7 +231,10 @@ class _Rows:
     def _note_fingers(self, rows: Sequence[Sequence[str]]) -> None:
         if self.columns.finger is not None and len(self._named) <= len(FINGERS):
             place, _ = self.columns.finger
-            self._named |= set(sorted({row[place] for row in rows})[: len(FINGERS) + 1])
+            named = {row[place].strip().lower() for row in rows} - {""}
+            if self.columns.names_finger:  # other words may be of something else
+                named &= set(FINGERS)
+            self._named |= set(sorted(named)[: len(FINGERS) + 1])
 
     def _counts(self, rows: Sequence[Sequence[str]]) -> NDArray[np.float32]:
         return np.array(

@@ -161,8 +161,31 @@ def test_rows_of_a_finger_each_are_not_of_one_finger(name: str, block: int) -> N
     assert f"column {name}: has rows of ff and of th: put all" in said
     said = refusal(content.encode())
     assert f"name no finger, but {name} may: put all fingers into one row" in said
+    said = refusal(re.sub(r"E2\d", "x", content).encode(), ["ff"])
+    assert "ff has 19 electrodes: a BioTac" in said
     of_one = content.replace("th,", "ff,").encode()
     assert len(rows_of(of_one, ["ff"])) == 2 * block
+
+
+@pytest.mark.parametrize(
+    ("header", "name", "words"),
+    [
+        ("E", "finger", ["FF", " ff ", "", "ff"]),
+        ("ff_e", "sensor", ["SP12", "SP07", "SP12", "SP07"]),
+        ("ff_e", "frame_id", ["1", "2", "3", "4"]),
+    ],
+)
+def test_a_column_that_names_no_second_finger_is_left_out(
+    header: str, name: str, words: Sequence[str]
+) -> None:
+    plain = renamed(lambda f, n: f"{header}{n}" if f == "ff" else f"{f}x{n}").decode().splitlines()
+
+    def beside(*cells: str) -> bytes:
+        lines = zip((name, *cells), plain, strict=True)
+        return "".join(f"{cell},{line}\n" for cell, line in lines).encode()
+
+    assert values(rows_of(beside(*words), ["ff"])) == values(rows_of(PLAIN, ["ff"]))
+    assert "has rows of ff and of th" in refusal(beside("ff", "th", "ff", "th"), ["ff"])
 
 
 @pytest.mark.parametrize(
@@ -189,7 +212,10 @@ def test_a_row_with_an_electrode_is_not_a_header(content: bytes) -> None:
             lambda f, n: f"bt_data{PLACES[f]}.electrode_data{n - 1}" if n < 20 else f"{f}x{n}",
             "bt_data0 has 19 electrodes: a BioTac",
         ),
-        (lambda f, n: f"field.bt_data{PLACES[f]}.electrode_data{n - 1}", "so on name no finger"),
+        (
+            lambda f, n: f"field.bt_data{PLACES[f]}.electrode_data{n - 1}",
+            "so on name no finger, and 3 are asked for",
+        ),
         (lambda f, n: f"{f}_e{n}" if (f, n) != ("mf", 7) else "x", "column mf_e7: this column is"),
         (lambda f, n: f"{f}_e{n - (f == 'ff')}", "column mf_e0: this column is missing"),
         (lambda f, n: f"{f}_e{n}" if f != "th" else f"x{n}", "the file has the fingers ff, mf"),
@@ -255,6 +281,15 @@ def layout(content: bytes, folder: Path, read_as: ReadAs | None = None) -> bool:
     return layout_of(write(folder, content), FINGERS, read_as, rate_hz).is_stream
 
 
+@pytest.mark.parametrize("unit_s", [1e-3, 1e-6, 1e-9])
+def test_the_unit_of_times_is_known_by_their_steps(tmp_path: Path, unit_s: float) -> None:
+    names, cells = sweeps()
+    place = names.index("t")
+    cells[:, place] = [f"{float(value) / unit_s:.0f}" for value in cells[:, place]]
+    found = layout_of(write(tmp_path, written(names, cells)), FINGERS)
+    assert (found.is_stream, found.unit_s) == (True, unit_s)
+
+
 def test_grasps_with_times_a_minute_apart_are_doubted(tmp_path: Path) -> None:
     header, *lines = DEMO_TABLE.read_text().splitlines()
     content = "\n".join(["time," + header, *(f"{60 * n},{line}" for n, line in enumerate(lines))])
@@ -305,6 +340,45 @@ def test_sweeps_without_times_are_never_a_table(tmp_path: Path, every: int, mixe
     if every <= 10:
         with pytest.raises(RecordingError, match="change as sweeps of a stream do"):
             layout(content, tmp_path, "table")
+
+
+def any_value(cells: NDArray[np.str_], random: np.random.Generator) -> None:
+    for place in (5, 30, 60):
+        cells[:, place] = random.integers(0, 4096, len(cells))
+
+
+def missing(cells: NDArray[np.str_], random: np.random.Generator) -> None:
+    cells[random.random(cells.shape) < 0.05] = ""
+
+
+def noisy(cells: NDArray[np.str_], random: np.random.Generator) -> None:
+    values = cells.astype(float) + random.normal(0.0, 8.0, cells.shape)
+    cells[:] = np.clip(values, 0.0, 4095.0).astype(int)
+
+
+@pytest.mark.parametrize("damage", [any_value, missing, noisy])
+def test_sweeps_with_broken_electrodes_are_never_a_table(
+    tmp_path: Path, damage: Callable[..., None]
+) -> None:
+    names, cells = sweeps()
+    damage(cells[:, 3:75], np.random.default_rng(3))
+    names[names.index("t")] = "number"
+    content = written(names, cells)
+    with pytest.raises(RecordingError, match=r"sweeps of a stream \(--as stream.*--as table"):
+        layout(content, tmp_path)
+    with pytest.raises(RecordingError, match="change as sweeps of a stream do"):
+        layout(content, tmp_path, "table")
+
+
+def test_several_readings_of_each_grasp_are_a_table_if_told(tmp_path: Path) -> None:
+    header, *lines = DEMO_TABLE.read_text().splitlines()
+    cells = np.array([line.split(",") for line in lines[:40]]).repeat(6, axis=0)
+    noise = np.random.default_rng(2).normal(0.0, 3.0, (240, 72))
+    cells[:, 2:] = np.round(cells[:, 2:].astype(float) + noise).astype(int)
+    content = written(header.split(","), cells)
+    with pytest.raises(RecordingError, match="240 of 240 rows nearly repeat another"):
+        layout(content, tmp_path)
+    assert not layout(content, tmp_path, "table")
 
 
 @pytest.mark.parametrize(
