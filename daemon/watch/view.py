@@ -65,6 +65,8 @@ A daemon without readings sends the next `unknown` only after `silence_ms`.
 """
 PROMPT_NS = 50_000_000
 """Longest time that a message may have waited here and still serve to compare the clocks, ns."""
+AGE_MAX_MS = 1e12
+"""Longest age of a reading that is reckoned with, ms, 30 years: any more may be no number of ns."""
 CATCHING_UP_NS = 1_000_000_000
 """Time to reconnect after the viewer itself stood still, ns."""
 NO_SHARE = -1
@@ -190,7 +192,7 @@ class View:
 
     def _arrival_ns(self, verdict: Verdict, earliest_ns: int, latest_ns: int) -> int:
         """Return the arrival of a verdict, ns, by its own time, because it may have waited here."""
-        sent_ns = verdict.t_mono_ns + round(verdict.age_ms * 1e6)
+        sent_ns = verdict.t_mono_ns + round(min(verdict.age_ms, AGE_MAX_MS) * 1e6)
         if self._verdict_ns < self.stood_still[1]:
             self._clocks_ns = None  # one of the clocks may have stopped in a sleep of the computer
         if latest_ns - earliest_ns <= PROMPT_NS:

@@ -80,6 +80,10 @@ def test_a_repeated_message_is_not_a_sign_of_life() -> None:
     assert view.snapshot(101 * MS).tone is Tone.SILENT
 
 
+def test_an_absurd_age_is_shown_and_ends_nothing() -> None:
+    assert seen_after(Decision.SLIP, age_ms=1e308).headline == "slip"
+
+
 def test_gaps_are_counted_as_lost_but_not_over_a_restart() -> None:
     view = after(*[(b"verdict.right", verdict(seq)) for seq in (3, 4, 9)])
     assert figures(view.snapshot(0).timing)["lost here"] == "4 messages"
@@ -234,17 +238,16 @@ def outcome(grasp: int, ended: Literal["stable", "slip"], judged_by: str | None 
 
 def test_the_last_grasps_stay_with_how_their_lifts_ended() -> None:
     view = a_view()
+    decisions = {9: Decision.SLIP, 10: Decision.UNKNOWN}
     for grasp in range(1, 12):
-        seq = 100 + 2 * grasp
-        watched = grasp == 10
-        decision = Decision.UNKNOWN if watched else Decision.SLIP if grasp == 9 else Decision.STABLE
-        reasons = [Reason.UNPROVEN] if watched else []
-        message = verdict(
-            seq, decision, grasp=grasp, judged=True, supervised=watched, reasons=reasons
-        )
+        told: dict[str, Any] = {"grasp": grasp, "judged": True}
+        if grasp == 10:
+            told |= {"supervised": True, "reasons": [Reason.UNPROVEN]}
+        message = verdict(100 + 2 * grasp, decisions.get(grasp, Decision.STABLE), **told)
         for _ in range(2):  # a judgement that is repeated is listed once
             view.take(b"verdict.right", message, grasp * 1000 * MS)
-        view.take(b"verdict.right", verdict(seq + 1, grasp=grasp), grasp * 1000 * MS)
+        open_hand = verdict(101 + 2 * grasp, grasp=grasp)
+        view.take(b"verdict.right", open_hand, grasp * 1000 * MS)
     view.take(b"outcome.right", outcome(1, "slip"), 0)
     view.take(b"outcome.right", outcome(8, "stable"), 0)
     view.take(b"outcome.right", outcome(9, "slip", "another"), 0)
