@@ -40,19 +40,6 @@ def test_a_step_that_fails_leaves_the_former_file_alone(
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_the_content_and_then_the_name_are_on_the_disk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path, synced = tmp_path / "kept", []
-    monkeypatch.setattr(os, "fsync", lambda handle: synced.append((_kind(handle), path.exists())))
-    write_atomically(path, b"new")
-    assert synced == [("file", False), ("folder", True)]
-
-
-def _kind(handle: int) -> str:
-    return "folder" if stat.S_ISDIR(os.fstat(handle).st_mode) else "file"
-
-
 def test_a_regular_file_is_read_up_to_its_limit(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"12345")
     assert read_regular(tmp_path / "file", 5) == b"12345"

@@ -21,10 +21,6 @@ def worker() -> Iterator[Worker[object]]:
     made.close(PATIENCE_S)
 
 
-def named_slow() -> list[threading.Thread]:
-    return [thread for thread in threading.enumerate() if thread.name == "slow"]
-
-
 def test_a_job_wakes_the_loop_and_gives_one_result(
     worker: Worker[object],
 ) -> None:
@@ -36,19 +32,6 @@ def test_a_job_wakes_the_loop_and_gives_one_result(
     assert worker.take() == 7
     assert worker.take() is None
     assert worker.filenos == []
-
-
-def test_a_worker_that_was_closed_can_start_again() -> None:
-    worker: Worker[object] = Worker("slow")
-    go = threading.Event()
-    assert worker.submit(go.wait)
-    assert not worker.close(0.0)
-    assert worker.submit(lambda: 2)  # the first thread must not get this job
-    assert worker.take(PATIENCE_S) == 2
-    go.set()
-    assert worker.close(PATIENCE_S)
-    for thread in named_slow():
-        thread.join(PATIENCE_S)
 
 
 def test_where_the_system_refuses_a_thread_a_job_is_refused(

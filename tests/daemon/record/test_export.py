@@ -80,6 +80,16 @@ def sweeps(number: int, seed: int = 0) -> list[NDArray[np.uint16]]:
     return [(base + 37 * step * (-1) ** step).astype(np.uint16) for step in range(number)]
 
 
+def record(path: Path, *grasps: tuple[NDArray[np.integer[Any]], Ending, str | None]) -> None:
+    """A recording of grasps: counts, outcome and object of each."""
+    writer = Writer(path)
+    for number, (counts, _, _) in enumerate(grasps, 1):
+        writer.judged(number, counts)
+    for number, (_, outcome, name) in enumerate(grasps, 1):
+        writer.outcome(number, outcome, name)
+    writer.close()
+
+
 def test_a_row_is_judged_unless_electrodes_are_broken(
     tmp_path: Path,
 ) -> None:
@@ -116,19 +126,11 @@ def test_what_is_left_out_is_counted(tmp_path: Path) -> None:
 
 
 def test_of_grasps_with_the_same_counts_the_first_is_kept(tmp_path: Path) -> None:
-    writer = Writer(tmp_path / "a.mcap")
     mug, bowl = sweeps(2)
-    for grasp, counts in enumerate((mug, bowl, mug)):
-        writer.judged(grasp, counts)
-    writer.outcome(0, "slip")
-    writer.outcome(1, "stable")
-    writer.outcome(2, "stable")
-    writer.close()
+    record(tmp_path / "a.mcap", (mug, "slip", None), (bowl, "stable", None), (mug, "stable", None))
     found = collect([tmp_path / "a.mcap"])
-    assert [(number, row.slipped) for (_, number), row in found.grasps.items()] == [
-        (0, True),
-        (1, False),
-    ]
+    slipped = {number: row.slipped for (_, number), row in found.grasps.items()}
+    assert slipped == {1: True, 2: False}
     assert found.repeated == 1
     result = graspd("export-grasps", tmp_path / "a.mcap", "--out", tmp_path / "a.csv")
     assert "1 left out with the very counts of one before" in result.stdout
@@ -163,11 +165,13 @@ def test_a_row_has_the_reported_object_or_the_options(
 
 
 def test_the_library_reads_the_grasps_that_are_exported(tmp_path: Path) -> None:
-    writer = Writer(tmp_path / "a.mcap")
-    for grasp, counts in enumerate(sweeps(3), 1):
-        writer.judged(grasp, counts)
-        writer.outcome(grasp, "slip" if grasp == 2 else "stable", "mug")
-    writer.close()
+    first, second, third = sweeps(3)
+    record(
+        tmp_path / "a.mcap",
+        (first, "stable", "mug"),
+        (second, "slip", "mug"),
+        (third, "stable", "mug"),
+    )
     out = {name: tmp_path / f"t.{name}" for name in ("csv", "parquet")}
     for name, options in (("csv", ()), ("parquet", ("--parquet",))):
         words = "export-grasps", tmp_path / "a.mcap", "--out", out[name], *options
@@ -182,10 +186,7 @@ def test_the_library_reads_the_grasps_that_are_exported(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["=HYPERLINK(0)", "mug\n=1"])
 def test_a_name_that_a_spreadsheet_calculates_is_refused(tmp_path: Path, name: str) -> None:
-    writer = Writer(tmp_path / "a.mcap")
-    writer.judged(1, sweeps(1)[0])
-    writer.outcome(1, "slip", name)
-    writer.close()
+    record(tmp_path / "a.mcap", (sweeps(1)[0], "slip", name))
     out = tmp_path / "t.csv"
     result = graspd("export-grasps", tmp_path / "a.mcap", "--out", out)
     assert (result.returncode, out.exists()) == (2, False)
@@ -211,17 +212,13 @@ def test_an_outcome_may_be_told_to_the_next_start(tmp_path: Path) -> None:
 def test_counts_of_another_shape_or_size_are_refused(
     tmp_path: Path, counts: list[list[int]]
 ) -> None:
-    writer = Writer(tmp_path / "a.mcap")
-    writer.judged(1, np.array(counts))
-    writer.outcome(1, "slip")
-    writer.close()
+    record(tmp_path / "a.mcap", (np.array(counts), "slip", None))
     with pytest.raises(RecordingError, match=r"a\.mcap: outcome message"):
         collect([tmp_path / "a.mcap"])
 
 
 def test_without_any_outcome_nothing_is_written(tmp_path: Path) -> None:
-    writer = Writer(tmp_path / "a.mcap")
-    writer.close()
+    record(tmp_path / "a.mcap")
     result = graspd("export-grasps", tmp_path / "a.mcap", "--out", tmp_path / "t.csv")
     assert result.returncode == 1
     assert "no judged grasp with an outcome" in result.stderr

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -21,13 +20,7 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "gzip": lambda path: read_grasps(DEMO_TABLE).to_csv(path, index=False, compression="gzip"),
     "Parquet": lambda path: read_grasps(DEMO_TABLE).to_parquet(path),
     "Excel in Germany": lambda path: read_grasps(DEMO_TABLE).to_csv(path, sep=";", index=False),
-    "floats": lambda path: floats().to_csv(path, index=False),
 }
-
-
-def floats() -> Any:  # noqa: ANN401
-    frame = read_grasps(DEMO_TABLE)
-    return frame.assign(slipped=frame["slipped"].astype(float))
 
 
 @pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)

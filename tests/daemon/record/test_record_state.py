@@ -96,18 +96,6 @@ def test_the_next_file_begins_with_what_was_known(tmp_path: Path, clock: Clock) 
     assert writing.counters["record"]["recorded"] == loop.sent - 7
 
 
-def test_no_file_is_begun_without_a_word_of_the_loop(tmp_path: Path, clock: Clock) -> None:
-    loop = Loop()
-    writing = recorder(tmp_path, loop.header, clock=clock)
-    for _ in range(45):
-        loop.send(writing, VERDICT)
-        assert pass_time(clock, writing)["files"] == 1
-    loop.send(writing, STATUS)
-    assert pass_time(clock, writing)["files"] == 2
-    writing.close()
-    assert header_of(files(tmp_path)[1]).grasps == loop.sent
-
-
 def test_a_refusing_disk_is_warned_of_once_and_tried_again(
     tmp_path: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

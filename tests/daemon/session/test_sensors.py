@@ -119,21 +119,6 @@ def test_untouched_sensors_rest_as_they_did(untouched: NDArray[np.uint16]) -> No
     assert moved_fingers(first, np.roll(last, 1, axis=0)) != []
 
 
-@pytest.mark.parametrize(("step", "moved"), [(49.0, []), (51.0, [1])])
-@pytest.mark.parametrize("common", [0.0, -300.0])
-def test_what_all_electrodes_of_a_finger_share_counts_for_nothing(
-    step: float, moved: list[int], common: float
-) -> None:
-    before = np.full((3, 24), 2000.0)
-    now = before + common
-    now[1, :8] += step
-    now[1, 8:16] -= step
-    now[1, 16:20] += 2 * step
-    assert moved_fingers(before, now) == moved
-    now[1, :13] = 0.0  # not known: eleven are too few
-    assert moved_fingers(before, now) == []
-
-
 def begin(day: Day, robot: Robot) -> None:
     """Calibrate by a day, and keep where its sensors rest."""
     day.teach(robot.pipeline.session, 100)

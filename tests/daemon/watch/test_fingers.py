@@ -4,18 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
 from graspd.daemon.watch.snapshot import FingerImage
 from graspd.daemon.watch.view import View
 from graspd.models.layout import D1
-from graspd.models.levels import RestCounts
 from tests.daemon.watch.watch_fakes import MS, RESTING, a_view, after, status, tactile, verdict
 
-SOUND = np.ones(24, dtype=np.bool_)
 WIDTH = 11
 
 
@@ -63,21 +59,6 @@ def test_a_rest_is_learned_only_while_idle_and_tared() -> None:
     for seq in range(90, 200):
         view.take(b"tactile.right", tactile(seq, RESTING, [1400] * 24), 0)
     assert view.snapshot(0).fingers[1].levels == [100] * 132
-
-
-def learned(*counts: float) -> NDArray[np.float64] | None:
-    """The rest after a hundred readings of 3000 and these."""
-    rest = RestCounts()
-    for count in [3000.0] * 100 + list(counts):
-        rest.learn("ff", np.full(24, count), SOUND)
-    return rest.of("ff")
-
-
-def test_the_rest_follows_a_drift_and_hardly_an_unseen_touch() -> None:
-    drifted = learned(*[3010.0] * 500)  # ten times the fifty readings that a share of 2 % goes back
-    assert drifted == pytest.approx(np.full(24, 3010.0), abs=0.01)
-    touched = learned(*[1400.0] * 3)
-    assert touched == pytest.approx(np.full(24, 2998.8))  # three times 2 % of 20 counts
 
 
 def test_without_a_rest_an_image_shows_how_electrodes_differ() -> None:

@@ -102,7 +102,7 @@ def whole_hand(view: View, hand: str, decision: Decision, seq: int = 0) -> Snaps
         reasons=[Reason.STALE] if decision is Decision.UNKNOWN else [],
         contact=FIVE,
         still_ms=131.0,
-        motion=dict.fromkeys(FIVE, 1.2),
+        motion=dict.fromkeys(FIVE, 1.2) | {"rf": None},
         motion_limits=dict.fromkeys(FIVE, 1.5),
     )
     view.take(f"status.{hand}".encode(), status(seq, learner=LEARNER), 0)
