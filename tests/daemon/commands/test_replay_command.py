@@ -220,3 +220,15 @@ def test_a_replay_outlasts_a_sleep_of_the_computer(
         assert process.wait(TIMEOUT_S) == 0
     grasps = {json.loads(line)["grasp"] for line in lines}
     assert grasps == set(range(1, DEMO_TABLE.read_text().count("\n")))
+
+
+def test_a_malformed_count_is_repaired_and_strict_refuses_it(tmp_path: Path) -> None:
+    recording = tmp_path / "grasps.csv"
+    header, first, *rest = DEMO_TABLE.read_text().splitlines()
+    label, number, _, *cells = first.split(",")
+    recording.write_text("\n".join([header, ",".join((label, number, "4096", *cells)), *rest, ""]))
+    told = json.loads(graspd("replay", recording, "--json").stdout.partition("\n")[0])
+    assert (told["valid"], told["repaired"]) == (True, ["ff_1"])
+    strict = graspd("replay", recording, "--strict", "--json")
+    assert strict.returncode == 2
+    assert f"{recording}, line 2, column ff_biotac_1: " in strict.stderr.splitlines()[-1]

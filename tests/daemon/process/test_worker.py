@@ -34,6 +34,17 @@ def test_a_job_wakes_the_loop_and_gives_one_result(
     assert worker.filenos == []
 
 
+def test_a_job_is_refused_until_the_last_result_is_taken(worker: Worker[object]) -> None:
+    go = threading.Event()
+    assert worker.submit(go.wait)
+    assert worker.take() is None
+    assert not worker.submit(lambda: 2)
+    go.set()
+    assert select.select(worker.filenos, [], [], PATIENCE_S)[0]
+    assert not worker.submit(lambda: 2)
+    assert worker.take() is True
+
+
 def test_where_the_system_refuses_a_thread_a_job_is_refused(
     worker: Worker[object], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -212,7 +212,18 @@ def test_the_process_ends_with_the_daemon_and_leaves_no_file(tmp_path: Path) -> 
     assert {path.name for path in tmp_path.iterdir()} == {"v", "v.lock"}
 
 
-def test_its_process_ends_when_a_thread_of_it_has_ended(tmp_path: Path) -> None:
+def test_connections_take_no_descriptor_of_the_daemon(tmp_path: Path) -> None:
+    with Publisher(f"ipc://{tmp_path}/v"), contextlib.ExitStack() as stack:
+        before = len(os.listdir("/proc/self/fd"))
+        (process,) = processes()
+        for _ in range(50):
+            peer = stack.enter_context(socket.socket(socket.AF_UNIX))
+            peer.connect(f"{tmp_path}/v")
+        wait_until(lambda: len(os.listdir(f"/proc/{process}/fd")) > 50)
+        assert len(os.listdir("/proc/self/fd")) == before + 50  # the other ends
+
+
+def test_the_process_ends_when_a_thread_of_it_has_ended(tmp_path: Path) -> None:
     with contextlib.closing(Listener(f"ipc://{tmp_path}/v")) as listener:
         plan = Plan(str(tmp_path), [listener.endpoint], [listener.fileno()], 10, [0], None)
         code = "import zmq; from graspd.daemon.publish import porter;"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import itertools
 import os
 from collections.abc import Callable, Iterator
@@ -172,6 +174,17 @@ def test_a_file_in_place_of_the_folder_stays(tmp_path: Path) -> None:
         with pytest.raises(SessionFileError, match=r"right: cannot (keep|read) the session"):
             use()
     assert path.read_bytes() == b"?"
+
+
+def test_a_disk_without_locks_is_not_in_use(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def flock(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    with pytest.raises(SessionFileError, match="cannot keep the session: No locks available"):
+        SessionFolder(tmp_path).lock()
 
 
 def test_files_with_other_names_are_let_alone(tmp_path: Path) -> None:
