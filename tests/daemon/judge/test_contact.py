@@ -94,7 +94,7 @@ def held(*, for_ns: int, fall: float) -> Touch:
         (held(for_ns=60 * S + 1, fall=99.0), -99.0, False),
     ],
 )
-def test_after_a_long_hold_or_far_above_its_rest_a_finger_is_tared_again(
+def test_a_finger_held_long_or_risen_is_tared_again(
     touch: Touch, middle: float, is_lost: bool
 ) -> None:
     assert touch.has_lost_rest(100 * S, middle) == is_lost
@@ -229,9 +229,7 @@ def test_twelve_electrodes_make_a_tare(usable: int, known: int | None) -> None:
         *((2980, 3020, True), (2979, 3021, False)),  # sigma 29.7 or 31.1, the limit is 30
     ],
 )
-def test_an_electrode_at_a_rail_or_far_noisier_has_no_rest(
-    low: int, high: int, known: bool
-) -> None:
+def test_an_electrode_at_a_rail_or_noisier_has_no_rest(low: int, high: int, known: bool) -> None:
     sweeps = wavering(2)
     for place, sweep in enumerate(sweeps):
         sweep[5] = (low, high)[place % 2]

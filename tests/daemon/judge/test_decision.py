@@ -101,7 +101,7 @@ def test_any_reason_makes_the_verdict_unknown(where: str) -> None:
         assert decide(0.0, health, moment, 0, LIMITS) == (Decision.UNKNOWN, (reason,))
 
 
-def test_by_default_nothing_is_unsure_and_100_ms_are_not_stale() -> None:
+def test_by_default_only_more_than_100_ms_is_stale() -> None:
     for p_slip, age_ns, wanted in (
         (0.499999, 100_000_000, (Decision.STABLE, ())),
         (0.5, 100_000_000, (Decision.SLIP, ())),

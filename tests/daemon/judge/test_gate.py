@@ -168,7 +168,7 @@ SCENARIOS = [
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda scenario: scenario.name)
-def test_gate_follows(scenario: Scenario) -> None:
+def test_the_gate_follows_each_scenario(scenario: Scenario) -> None:
     played = play(scenario)
     assert played.story == scenario.changes
     if scenario.settled_s is not None:

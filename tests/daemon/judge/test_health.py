@@ -94,7 +94,9 @@ def test_more_than_two_jumps_above_a_spike_flag_an_electrode(
 
 @pytest.mark.parametrize(("movers", "by", "jumpy"), [(4, 31, True), (5, 31, False), (5, 30, True)])
 @pytest.mark.parametrize("sign", [1, -1])
-def test_it_jumps_while_the_others_keep_still(movers: int, by: int, jumpy: bool, sign: int) -> None:
+def test_an_electrode_jumps_while_the_others_keep_still(
+    movers: int, by: int, jumpy: bool, sign: int
+) -> None:
     """A touch moves more than four electrodes by more than 30 counts."""
     jumps = {0: 400, 1: -400, 2: 400}
     steps = steps_of(3, {at: sign * jump for at, jump in jumps.items()}, movers, sign * by)

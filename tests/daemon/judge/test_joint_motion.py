@@ -72,7 +72,7 @@ def test_joints_are_late_and_then_lost(
     assert not motion.is_frozen
 
 
-def test_joints_of_the_future_or_none_are_waited_for_a_second() -> None:
+def test_joints_not_yet_there_are_waited_for_a_second() -> None:
     motion, last_ns = turning(100.0, 0.0)
     for waits, now_ns in ((JointMotion(), START_NS), (motion, last_ns - 151 * MS)):
         for ms, reason in ((0, Reason.JOINTS_LATE), (1000, Reason.JOINTS_LATE), (1001, None)):

@@ -135,7 +135,7 @@ def test_the_noise_of_an_electrode_counts_until_it_is_lost() -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, -1.0, float("nan")])
-def test_no_such_share_of_false_alarms_is_accepted(share: float) -> None:
+def test_impossible_shares_of_false_alarms_are_refused(share: float) -> None:
     with pytest.raises(ValueError, match="false_alarms"):
         Motion(3, share)
 
@@ -152,7 +152,7 @@ def test_a_slow_line_has_three_sweeps_and_one_before() -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [1000 / 14, 100.0, 1000.0])
-def test_who_looks_late_sees_what_who_always_looked_sees(rate_hz: float) -> None:
+def test_motion_looked_at_late_is_as_if_always_looked(rate_hz: float) -> None:
     always, late = Motion(1, 0.05), Motion(1, 0.05)
     counts = np.rint(wavering(6.0, rate_hz, 4.0, 5)).astype(np.uint16)
     for index, sweep in enumerate(counts):

@@ -93,7 +93,7 @@ def test_an_open_hand_is_not_told_to_release_anything() -> None:
     assert (said.moment.grasp, said.reasons) == (1, (Reason.NO_CONTACT,))
 
 
-def test_a_slip_and_its_outcome_say_nothing_of_the_next_grasp() -> None:
+def test_a_slip_says_nothing_of_the_next_grasp() -> None:
     hand = trusting(gate_limits(), None)
     hand.play(Feel("faint", times=35, answer=0.9))
     tell(hand, 1, slipped=True)

@@ -144,7 +144,7 @@ def test_signals_one_after_the_other_leave_nothing(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_all_peers_get_descriptors(tmp_path: Path) -> None:
+def test_the_limit_of_descriptors_is_raised_for_peers(tmp_path: Path) -> None:
     scene = demo_scene(tmp_path, "loop = true")
     with start("run", scene, before=("prlimit", "--nofile=512:8192")) as process:
         wait_for(tmp_path / "v")

@@ -145,7 +145,7 @@ def test_slips_alone_make_no_slip_stable(bts3_dir: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["cnn1", "small-session"])
-def test_the_mean_of_all_grasps_is_nobodys_grasp(name: str) -> None:
+def test_the_mean_of_all_grasps_is_never_judged(name: str) -> None:
     model = TactileModel(zoo.find(name))
     random = np.random.default_rng(5)
     centre = np.array(model.contract.seen.centre)
