@@ -113,7 +113,7 @@ class JointMotion:
         )
 
     def _drop_lost(self, t_ns: int) -> None:
-        """Forget sets whose last reading is older than `LOST_NS`, or later than `t_ns`."""
+        """Forget sets last read over `LOST_NS` before `t_ns`, or over `LATE_NS` after it."""
         for names, latest_ns in list(self.latest_ns.items()):
             if -LATE_NS <= t_ns - latest_ns <= LOST_NS:
                 continue

@@ -195,9 +195,8 @@ class StepRing:
     def mean(self, values: NDArray[np.float32], begin: int) -> list[float]:
         """Return each finger's mean over its electrodes usable since step `begin`.
 
-                It is infinite for a finger with fewer than `SOUND_MIN` of them.
-
-        `values`: shape (fingers * 24,).
+        It is infinite for a finger with fewer than `SOUND_MIN` of them. `values`: shape
+        (fingers * 24,).
         """
         values, since_ns = values.reshape(self._total.shape), self.times_ns[begin]
         if self._all_usable_since_ns <= since_ns:

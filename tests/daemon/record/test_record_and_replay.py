@@ -189,6 +189,12 @@ def test_the_summary_of_a_replay_counts_recorded_outcomes(rotated: Lab) -> None:
     assert graspd("replay", "--outcomes", *rotated.files).returncode == 2
 
 
+def test_sweeps_of_a_recording_are_never_judged_one_by_one(rotated: Lab) -> None:
+    result = graspd("replay", *rotated.files, "--gate", "every")
+    assert (result.returncode, result.stdout) == (2, "")
+    assert "gate mode `every` judges each row of a grasp table" in result.stderr
+
+
 def test_files_that_do_not_follow_each_other_are_named(
     rotated: Lab, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -16,7 +16,7 @@ from graspd.daemon.judge.exchange import Exchanged
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
 from graspd.daemon.publish.companion import LoopEvent
 from graspd.daemon.record.player import McapReplayDriver
-from graspd.daemon.record.topics import Topic, schemas
+from graspd.daemon.record.topics import Topic, flat, schemas
 from graspd.daemon.record.viewers import INFO, SCALE, WARNING, Viewer
 from graspd.models.layout import D1
 from graspd.models.session_statistics import SessionState
@@ -58,6 +58,13 @@ def test_a_viewer_can_read_the_schema_of_every_topic(topic: Topic) -> None:
     schema = json.loads(text)
     assert schema["type"] == "object"
     assert list(faults(schema, topic)) == []
+
+
+def test_an_unknown_finger_is_a_state_of_its_own() -> None:
+    told = {"fingers": {"ff": "slide", "mf": None}, "motion": {"ff": None}, "p_slip": None}
+    assert flat(told) == {"fingers": {"ff": "slide", "mf": "unknown"}, "motion": {}}
+    fields = json.loads(schemas()[Topic.VERDICT][1])["properties"]["fingers"]["properties"]
+    assert fields["ff"] == {"type": "string", "enum": ["free", "touch", "slide", "unknown"]}
 
 
 def reading(counts: NDArray[np.int64], faulty: tuple[int, ...] = ()) -> object:

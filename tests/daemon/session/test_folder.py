@@ -106,6 +106,18 @@ def test_a_kill_at_any_step_loses_no_session(tmp_path: Path) -> None:
     assert found == {(2,), (13, 2), (14, 13, 2), (14, 13)}
 
 
+def test_starts_without_a_grasp_evict_no_session(tmp_path: Path) -> None:
+    taught = [KeptSession(state(each), FINGERS, {}) for each in (5, 4, 3, 2, 1)]
+    with SessionFolder(tmp_path) as folder:
+        folder.save(taught)
+        for serial in "AB":
+            others = [each for each in folder.load().values() if isinstance(each, KeptSession)]
+            folder.save([KeptSession(None, FINGERS, {"ff": serial}), *others])
+            assert kept_grasps(tmp_path) == [0, 5, 4, 3, 2, 1]
+        folder.save([KeptSession(state(6), FINGERS, {}), *taught])
+    assert kept_grasps(tmp_path) == [6, 5, 4, 3, 2]
+
+
 def test_a_count_of_the_risk_is_not_an_empty_session() -> None:
     """Without learning an outcome moves nothing else."""
     part = Trust("model", INPUTS, RiskLimits(0.1), learns=False)

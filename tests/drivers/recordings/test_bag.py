@@ -280,7 +280,7 @@ def test_bags_of_two_hands_are_not_one_run(tmp_path: Path) -> None:
             driver.read_ready()
 
 
-def test_a_bag_without_the_topic_names_its_topics(
+def test_a_bag_without_the_topic_or_as_a_table_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bag = BagOf(1)
@@ -288,6 +288,9 @@ def test_a_bag_without_the_topic_names_its_topics(
         writer.add_connection("/arm/joints", "sensor_msgs/msg/JointState", typestore=bag.store)
     assert main(["replay", str(tmp_path / "arm.bag")]) == 2
     assert "no topic of sr_robot_msgs/BiotacAll, but /arm/joints" in capsys.readouterr().err
+    path = bag.write(tmp_path / "hand.bag", noise(5))
+    assert main(["replay", str(path), "--gate", "every"]) == 2
+    assert "gate mode `every` judges each row of a grasp table" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -158,6 +158,10 @@ def test_a_last_row_without_line_end_is_cut_off() -> None:
     assert (last.faults == ElectrodeFault.CUT_OFF).all()
     with pytest.raises(RecordingError, match=r"line 4: the last row has no line end; .* cut off"):
         rows_of(table(3).rstrip(b"\n"), strict=True)
+    (wrong,) = rows_of(table(1, {0: {"th_biotac_24": "26x"}}).rstrip(b"\n"))
+    assert wrong.faults[2, 23] == ElectrodeFault.CUT_OFF | ElectrodeFault.NOT_A_COUNT
+    (row,) = rows_of(stream(["0"], {"FFJ1": ["0.5"]}).rstrip(b"\n"))
+    assert np.isnan(row.position_rad).all()
 
 
 @pytest.mark.parametrize("cell", ["nan", "", "1e999"])
