@@ -180,7 +180,7 @@ class _Rows:
             raise RecordingError(self.path, problem, column=self.columns.finger[1])
 
     def refuse_degrees(self) -> None:
-        """Raise if a tenth of a joint's angles are, as radians, beyond the reach of any joint."""
+        """Raise if over a tenth of a joint's angles are, as radians, beyond every joint's reach."""
         for name, place in self.columns.joints.items():
             angles = [number_of(row[place], decimal_comma=self._comma) for row in self.first]
             large = [angle for angle in angles if angle is not None and abs(angle) > ANGLE_MAX_RAD]
@@ -270,7 +270,7 @@ def _unit_s(rows: _Rows, column: TimeColumn, times: Sequence[float], step: float
 
 
 def _timed(rows: _Rows, column: TimeColumn, read_as: ReadAs | None) -> Layout:
-    """Return the layout of rows with times. Raises if they are grasps, or no time is valid."""
+    """Return the layout of rows with times. Raises if they may be grasps."""
     times = rows.times(column)
     step = _median_step(times)
     layout = Layout(rows.columns, is_stream=True, unit_s=_unit_s(rows, column, times, step))

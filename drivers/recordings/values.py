@@ -102,10 +102,10 @@ def is_outcome(cell: str) -> bool:
 
 
 def problem_with(cells: Sequence[str], *, decimal_comma: bool) -> str | None:
-    """Return why most values of electrodes are not counts; None: most are.
+    """Return why half of the values of electrodes, or a twentieth by their form, are not counts.
 
-    Values of a broken electrode are missing or out of range. No electrode has fractions, or
-    negative values other than -1, which stands for a missing one.
+    None: they are counts. Values of a broken electrode are missing or out of range. No electrode
+    has fractions, or negative values other than -1, which stands for a missing one.
     """
     given = [cell for cell in cells if cell.strip().lower() not in BLANK]
     wrong = [cell for cell in given if count_of(cell, decimal_comma=decimal_comma) is None]

@@ -85,7 +85,7 @@ class BridgeCounters(FrameCounters):
     bridge_rx_errors: int = 0
     """Damaged frames that the bridge received.
 
-    Like the counters above it is from the last STATUS, since the bridge's reset.
+    Counters named `bridge_` are those of the last STATUS, since the bridge's reset.
     """
 
 
@@ -214,7 +214,7 @@ class DeviceClock:
 
     @property
     def is_doubted(self) -> bool:
-        """True if the last PING contradicted the bounds: the rate is off by over `DRIFT_MAX`."""
+        """True if a PING or a reading contradicted the bounds, and no PING has agreed since."""
         return self._doubt_ns > 0
 
     def host_ns(self, tick: int, arrival_ns: int) -> int:

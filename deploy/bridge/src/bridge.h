@@ -54,7 +54,7 @@ struct bridge {
 };
 
 /* Look for the sensors and prepare the first HELLO. False if the configuration must not run: a
- * number is out of range, or a command is not a sampling command (0xA1, manual table 7). */
+ * number is out of range, or a command samples nothing, such as 0xA1 (manual table 7). */
 bool bridge_init(struct bridge *bridge, const struct bridge_config *config);
 
 /* Do what is due: at most one sweep, some bytes from the host, a STATUS, bytes to the host. Call

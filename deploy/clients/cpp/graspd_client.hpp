@@ -68,7 +68,7 @@ constexpr Nanoseconds CLOCK_SLACK_NS = 1'000'000;
 constexpr double DRIFT = 1e-3;
 // Largest total drift. A delay that grows as slowly looks the same.
 constexpr Nanoseconds DRIFT_MAX_NS = 20'000'000;
-// Time between two questions for the daemon's clock, also after an unanswered one.
+// Time between two questions for the daemon's clock, and after one that was not answered.
 constexpr Nanoseconds CLOCK_EVERY_NS = 1'000'000'000, CLOCK_RETRY_NS = 10'000'000'000;
 constexpr std::size_t FORMER_MAX = 16;  // ended starts of the daemon that are remembered
 // On TCP: time between two heartbeats, and time without one until reconnecting.
@@ -124,7 +124,7 @@ struct Verdict {
     std::optional<std::int64_t> seq;
     std::string boot_id;                 // empty before the first message
     std::optional<double> age_ms;        // least time since the reading's last byte
-    std::optional<double> p_slip_model;  // the same by the network alone
+    std::optional<double> p_slip_model;  // `p_slip` by the network alone
     std::int64_t outcomes = 0;           // number of outcomes that `p_slip` rests on
     bool supervised = false;             // graspd would learn from the lift; a person must watch
     std::optional<Risk> risk;
@@ -922,7 +922,7 @@ public:
     const Counts& counts() const { return newest_.counts; }
 
     // Number of lifts, before the last allowed one, of which graspd has no outcome. It cannot
-    // learn from them. With `[risk]` a lift that is never reported counts as a slip.
+    // learn from them. With `[risk]` one that was asked for and is never reported counts as a slip.
     std::int64_t unreported() const {
         std::int64_t found = forgotten_;
         for (const auto& [grasp, told] : lifts_) found += !told && grasp != last_;

@@ -60,7 +60,7 @@ QUEUE_MAX = 1000  # messages that wait to be read: ten seconds at 100 Hz
 # A client that reads nothing for longer reconnects, because its queue is old and full.
 READ_WITHIN_NS = 5_000_000_000
 # Shortest and longest time without a message after which a client reconnects. libzmq does not
-# # retry after a refusal, but the daemon may admit the client by then.
+# retry after a refusal, but the daemon may admit the client by then.
 QUIET_NS, QUIET_MAX_NS = 1_000_000_000, 10_000_000_000
 # The computer has slept if its two clocks differ by more. A sleep takes seconds, the
 # scheduler a moment between two looks at the clocks.
@@ -74,7 +74,7 @@ CLOCK_SLACK_NS = 1_000_000
 DRIFT = 1e-3
 # Largest total drift. A delay that grows as slowly looks the same.
 DRIFT_MAX_NS = 20_000_000
-# Time between two questions for the daemon's clock, also after an unanswered one.
+# Time between two questions for the daemon's clock, and after one that was not answered.
 CLOCK_EVERY_NS, CLOCK_RETRY_NS = 1_000_000_000, 10_000_000_000
 FORMER_MAX = 16  # most ended starts of the daemon that are remembered
 # On TCP: time between two heartbeats, and time without one until reconnecting.
@@ -333,8 +333,8 @@ class _Hand:
     def unreported(self) -> int:
         """Number of lifts, before the last allowed one, of which graspd has no outcome.
 
-        It cannot learn from them. With `[risk]` a lift that is never reported counts as a slip. The
-        logger `graspd_client` warns of the first one and of each tenth.
+        It cannot learn from them. With `[risk]` one that was asked for and is never reported counts
+        as a slip. The logger `graspd_client` warns of the first one and of each tenth.
         """
         untold = (key != self._last for key, told in self._lifts.items() if not told)
         return self._forgotten + sum(untold)
