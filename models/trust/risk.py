@@ -95,18 +95,20 @@ class Risk:
         S <= a N + BUDGET_START            S <= a N + BUDGET_MAX of any stretch of lifts
         S <= a N + BUDGET_START + M (1 - a)     of all lifts that were told or announced
 
-    1. A told `stable` lift adds a - y to the budget b, y = 1 for a slip; all else only lowers b. 2.
-    Hence b <= BUDGET_START + a N - S, which is S <= a N + BUDGET_START - b. 3. A stretch begins at
-    b <= BUDGET_MAX. In the same way S <= a N + BUDGET_MAX - b for it. 4. `stable` is said only
-    while b >= 1 - a. If each outcome is told before the next `stable`, a slip leaves b >= 0. This
-    gives the first two bounds. 5. Let m announced lifts be out. w = b - m (1 - a) is what is left
-    of b if all of them slip. 6. An announced grasp was called `stable` at b >= 1 - a and m < M.
-    Hence w >= -(M - 1) (1 - a) after its announcement. 7. An outcome of an announced lift lowers
-    neither w nor this minimum: a slip takes 1 - a from b and m by one. Caps leave b >=
-    BUDGET_START, and m <= M. 8. An announced lift that leaves the book without an outcome counts as
-    a slip. Hence 6 holds at every moment. 9. With the m lifts counted as slips, 2 is S <= a N +
-    BUDGET_START - w: the third bound. 10. Late outcomes of lifts without an announcement can leave
-    b < 0; `bound` adds that.
+    1. A told `stable` lift adds a - y to the budget b, y = 1 for a slip; all else only lowers b.
+    2. Hence b <= BUDGET_START + a N - S, which is S <= a N + BUDGET_START - b.
+    3. A stretch begins at b <= BUDGET_MAX. In the same way S <= a N + BUDGET_MAX - b for it.
+    4. `stable` is said only while b >= 1 - a. If each outcome is told before the next `stable`,
+       a slip leaves b >= 0. This gives the first two bounds.
+    5. Let m announced lifts be out. w = b - m (1 - a) is what is left of b if all of them slip.
+    6. An announced grasp was called `stable` at b >= 1 - a and m < M. Hence w >= -(M - 1) (1 - a)
+       after its announcement.
+    7. An outcome of an announced lift lowers neither w nor this minimum: a slip takes 1 - a from b
+       and m by one. Caps leave b >= BUDGET_START, and m <= M.
+    8. An announced lift that leaves the book without an outcome counts as a slip. Hence 6 holds at
+       every moment.
+    9. With the m lifts counted as slips, 2 is S <= a N + BUDGET_START - w: the third bound.
+    10. Late outcomes of lifts without an announcement can leave b < 0; `bound` adds that.
 
     The threshold, the learner, the model and the data play no part: any threshold has these bounds.
     They count what was told, true or not. It is a rule of online selective inference: Gibbs and
