@@ -58,7 +58,7 @@ _WINDOWS: Final = frozenset(
 )
 _BITRATES: Final = {
     "slcan": (10, 20, 50, 83.3, 100, 125, 250, 500, 750, 1000),
-    "seeedstudio": (10, 20, 50, 100, 125, 200, 250, 400, 500, 800, 1000),
+    "seeedstudio": (5, 10, 20, 50, 100, 125, 200, 250, 400, 500, 800, 1000),
 }
 """Rates that adapters of an interface support, kbit/s. Other interfaces take any rate."""
 _OWN_KEYS: Final = frozenset({"interface", "channel", "bitrate"})

@@ -96,9 +96,10 @@ class SweepClock:
         return until_ns - t_ns >= self._late_ns
 
     def timing(self, place: int, last: int, until_ns: int) -> Timing:
-        """Compare a sample with the current sweep; `last`: its furthest place, -1 for none."""
-        if last < 0:
-            return Timing.FITS
+        """Compare a sample with the current sweep; `last`: its furthest place.
+
+        A sweep without a sample (-1) takes any: it does not matter what this returns.
+        """
         if self.period_ns is None:
             late_ns: float = until_ns - self.t_ns - max(place - last, 0) * SLOT_MIN_NS
             is_early = late_ns < 0

@@ -9,9 +9,12 @@ from typing import Any
 import can
 import cantools.database
 import pytest
+from can.interfaces.seeedstudio import SeeedBus
+from can.interfaces.slcan import slcanBus
 from cantools.database.can.database import Database
 
 from graspd.drivers.base import DriverError, TactileReading
+from graspd.drivers.biotac import SEQUENCES
 from graspd.drivers.can.driver import CanBridgeDriver
 from graspd.drivers.can.frames import (
     ERROR,
@@ -178,13 +181,16 @@ def test_a_board_that_pads_frames_needs_its_option() -> None:
     assert counters.faulty_readings == 0
 
 
-def test_another_sequence_shows_after_twenty_readings() -> None:
-    made = CanStream("bus", ("ff", "mf", "th"), arbitration_id=SAMPLE_ID, sequence="all")
+@pytest.mark.parametrize("scene", ["all", "interleaved"])
+@pytest.mark.parametrize("board", sorted(SEQUENCES))
+def test_another_sequence_shows_after_twenty_readings(scene: str, board: str) -> None:
+    made = CanStream("bus", ("ff", "mf", "th"), arbitration_id=SAMPLE_ID, sequence=scene)
     for sweep in range(20):
         assert "sequence" not in made.describe()
-        for at, words, t_ns in samples(sweep):
+        for at, words, t_ns in samples(sweep, board):
             made.push(CanFrame(SAMPLE_ID, encode_sample(at, words)), t_ns)
-    assert made.describe()["sequence"].text == "is not all, as the scene says"
+    texts = [fact.text for name, fact in made.describe().items() if name == "sequence"]
+    assert texts == [f"is not {scene}, as the scene says"] * (board != scene)
 
 
 ORDER = ("th", "ff", "mf")
@@ -235,6 +241,17 @@ def test_an_interface_without_its_package_is_refused(
     monkeypatch.setattr("graspd.drivers.can.interfaces.find_spec", lambda _name: None)
     with pytest.raises(ValueError, match=says):
         CanBridgeDriver(interface, "can0")
+
+
+@pytest.mark.parametrize(
+    ("interface", "rates"),
+    [("slcan", slcanBus._BITRATES), ("seeedstudio", SeeedBus.BITRATE)],  # noqa: SLF001
+)
+def test_bit_rates_are_those_of_python_can(interface: str, rates: Mapping[int, object]) -> None:
+    for bitrate in rates:
+        CanBridgeDriver(interface, "/dev/ttyUSB0", bitrate=bitrate)
+    with pytest.raises(ValueError, match=f"has {', '.join(map(str, sorted(rates)))}$"):
+        CanBridgeDriver(interface, "/dev/ttyUSB0", bitrate=300_000)
 
 
 def test_frames_that_are_not_ours_are_counted_and_harm_nothing() -> None:

@@ -138,6 +138,8 @@ def test_repeated_words_make_no_copies_of_lost_samples(lost: int) -> None:
 @pytest.mark.parametrize(
     ("place", "after_ns", "is_next"),
     [
+        (4, 1_799_999, False),
+        (4, 1_800_000, True),
         (5, 1_899_999, False),
         (5, 1_900_000, True),
         (9, 2_299_999, False),
@@ -150,6 +152,65 @@ def test_an_unknown_period_is_the_fastest_boards(place: int, after_ns: int, is_n
     begun, late = samples(0)[:5], samples(0)[place]
     readings = feed(sweeps, [*begun, (*late[:2], begun[-1][2] + after_ns)])
     assert len(readings) == is_next
+
+
+@pytest.mark.parametrize("kept", [0, 10])
+def test_two_ends_in_succession_teach_the_period(kept: int) -> None:
+    """Every second sweep is lost, or has no end: too few lost samples to look like a pause."""
+    sweeps, _ = assembler()
+    stream = [samples(n) if n < 8 or n % 2 else samples(n)[:kept] for n in range(50)]
+    feed(sweeps, concatenated(stream))
+    assert sweeps.period_ns == PERIOD_NS
+    assert sweeps.expected_ns == samples(50)[-1][2]
+    feed(sweeps, samples(50)[:11])
+    assert sweeps.expected_ns == samples(50)[-1][2]
+
+
+@pytest.mark.parametrize("sequence", sorted(SEQUENCES))
+@pytest.mark.parametrize("rate_hz", [1, 400])
+def test_slow_and_fast_boards_are_understood(sequence: str, rate_hz: int) -> None:
+    """Nothing is known of the rate when the driver opens."""
+    sweeps, _ = assembler(sequence)
+    slot_ns = round(1e9 / rate_hz / len(SEQUENCES[sequence]))
+    stream = concatenated([samples(n, sequence) for n in range(40)])
+    readings = feed(sweeps, retimed(stream, [slot_ns * at for at in range(len(stream))]))
+    assert [number_in(r) for r in readings[-30:] if not r.faults.any()] == [*range(10, 40)]
+    assert sweeps.period_ns == slot_ns * len(SEQUENCES[sequence])
+
+
+def test_a_period_is_learned_though_each_sweep_has_losses() -> None:
+    sweeps, _ = assembler()
+    feed(sweeps, concatenated([samples(n)[:5] + samples(n)[6:] for n in range(6)]))
+    assert sweeps.period_ns == PERIOD_NS
+
+
+@pytest.mark.parametrize(
+    ("sweep", "step_ns", "t_ns", "late"),
+    [
+        # Until the period is known a sample takes 100 us, then 3/4 of a period before is early.
+        (0, 100_000, 2_100_000, 0),
+        (0, 100_000, 2_099_999, 1),
+        (9, SLOT_NS, 3 * SLOT_NS + 1, 0),
+        (9, SLOT_NS, 3 * SLOT_NS, 1),
+    ],
+)
+def test_a_jump_to_the_end_is_dropped_if_early(
+    sweep: int, step_ns: int, t_ns: int, late: int
+) -> None:
+    sweeps, counters = assembler()
+    stream = concatenated([samples(n) for n in range(sweep + 1)])
+    start_ns = sweep * PERIOD_NS
+    begun = retimed(stream[-24:-22] + stream[-3:-2], [0, step_ns, t_ns])
+    feed(sweeps, stream[:-24] + [(*sample[:2], sample[2] + start_ns) for sample in begun])
+    assert counters.late_frames == late
+
+
+def test_vague_times_teach_a_period_after_five_sweeps() -> None:
+    sweeps, counters = assembler()
+    for channel, words, t_ns in concatenated([samples(n) for n in range(20)]):
+        sweeps.push(channel, words, t_ns - 3 * MS, t_ns)
+    assert sweeps.period_ns == PERIOD_NS
+    assert (counters.untimed_frames, counters.readings) == (6 * 24, 14)
 
 
 def test_samples_of_vague_time_make_no_reading() -> None:

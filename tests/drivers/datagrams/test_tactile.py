@@ -83,7 +83,7 @@ def test_a_message_is_a_reading(fields: dict[str, object]) -> None:
 def test_another_message_is_counted_named_and_dropped(
     data: bytes, counter: str, said: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    assert received(data, data) == ([], {counter: 2})
+    assert received(data, data, data) == ([], {counter: 3})
     assert len(caplog.messages) == 1
     assert said in caplog.text
 
@@ -192,12 +192,16 @@ def test_no_message_is_younger_than_its_delay(
     assert found == pytest.approx(made, abs=0.001)
 
 
-@pytest.mark.parametrize(("zero_s", "made_ms"), [(4.5, 1511), (3.0, 2020)])
-def test_a_restart_may_have_another_zero_of_time(zero_s: float, made_ms: float) -> None:
+@pytest.mark.parametrize(
+    ("t_s", "received_ms", "made_ms"),
+    [(5.51, 2020, 1511), (4.01, 2020, 2020), (4.99, 1980, 991), (4.99, 1992, 1992)],
+)
+def test_time_that_falls_a_second_has_another_zero(
+    t_s: float, received_ms: int, made_ms: float
+) -> None:
     clock = SenderClock()
     clock.made_ns(5.0, 1000 * MS)
-    made_ns = clock.made_ns(zero_s + 1.01, 2020 * MS)
-    assert made_ns / MS == pytest.approx(made_ms, abs=0.03)
+    assert clock.made_ns(t_s, received_ms * MS) / MS == pytest.approx(made_ms, abs=0.03)
 
 
 def test_counts_after_a_new_start_or_loss_interrupt() -> None:
@@ -211,19 +215,20 @@ def test_counts_after_a_new_start_or_loss_interrupt() -> None:
 
 
 @pytest.mark.parametrize(
-    ("times", "readings"),
+    ("times", "interrupted"),
     [
-        ([10.0, 20.0, 30.0, 40.0], 1),  # milliseconds
-        ([1e7, 2e7, 3e7, 4e7], 1),  # nanoseconds
-        ([0.01, 0.02, 3600.03, 3600.04], 3),  # a clock that was set
-        ([0.01, 0.25, 0.26, 0.27], 4),  # a message that waited, and losses behind it
+        ([10.0, 20.0, 30.0, 40.0], [False]),  # milliseconds
+        ([1e7, 2e7, 3e7, 4e7], [False]),  # nanoseconds
+        ([0.01, 3600.02, 3600.03, 3600.04], [False, True, False]),  # a clock that was set
+        # A message that waited, and losses behind it: ten times 10 ms and 200 ms at most.
+        ([0.01, 0.02, 0.03, 0.33], [False] * 4),
+        ([0.01, 0.02, 0.03, 0.331], [False] * 3),
     ],
 )
-def test_sender_time_that_leaps_is_dropped(times: list[float], readings: int) -> None:
-    stream = TactileStream(FINGERS, "right")
-    for number, t_s in enumerate(times):
-        stream.receive(message(seq=number, t=t_s), 10 * number * MS)
-    assert (stream.counters.readings, stream.counters.bad_messages) == (readings, 4 - readings)
+def test_sender_time_that_leaps_is_dropped(times: list[float], interrupted: list[bool]) -> None:
+    readings, counters = received(*[message(seq=n, t=t_s) for n, t_s in enumerate(times)])
+    assert [reading.interrupted for reading in readings] == interrupted
+    assert counters.get("bad_messages", 0) == 4 - len(interrupted)
 
 
 @pytest.fixture

@@ -159,6 +159,25 @@ def test_a_packet_without_samples_takes_no_place(tactile_type: int, counter: str
 
 
 @pytest.mark.parametrize(
+    ("at", "counter", "lost"),
+    [
+        (ROUND - 2, "reordered_packets", []),
+        (ROUND - 1, "late_packets", [[row, 23] for row in range(3)]),
+    ],
+)
+def test_a_packet_overtaken_within_its_round_is_used(
+    at: int, counter: str, lost: list[list[int]]
+) -> None:
+    stream = packets(3)
+    stream[at : at + 2] = stream[at + 1], stream[at]
+    played = play_packets(stream)
+    assert flags(played.readings[0], MISSING) == lost
+    counted = {name: number for name, number in played.counters.as_dict().items() if number}
+    losses = {"faulty_readings": 1, "lost_packets": 1} if lost else {}
+    assert counted == {"packets": 42, "readings": 3, counter: 1, **losses}
+
+
+@pytest.mark.parametrize(
     ("after_ns", "lost"),
     [(MS, 0), (11 * MS - 1, 0), (11 * MS, 1), (25 * MS - 1, 1), (25 * MS, 2)],
 )
@@ -287,6 +306,7 @@ def test_a_round_wakes_the_loop_once(driver: PalmDriver, receiver: Receiver, clo
     assert driver.due_ns() == clock.now_ns + 11 * MS
     clock.now_ns += 11 * MS
     assert driver.fileno() is not None
+    assert driver.due_ns() == clock.now_ns + (10 * ROUND - 11) * MS
 
 
 def test_joints_come_calibrated_at_their_own_rate(receiver: Receiver, clock: Clock) -> None:
