@@ -85,7 +85,7 @@ class TactileStream:
         made_ns = self._clock.made_ns(message.stamp.t_s, t_ns)
         if leaps:
             drop(data, "`t` leaps: is it in seconds?", counters)
-            self._interrupted = counters.readings > 0
+            self._interrupted = True
             return None
         counters.late_messages += t_ns - made_ns > LATE_NS
         return [self._reading(message, made_ns)]

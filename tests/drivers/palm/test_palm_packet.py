@@ -120,7 +120,7 @@ def parse(data: bytes) -> PalmPacket | None:
     return parse_packet(data, PalmCounters())
 
 
-@pytest.mark.parametrize("appended", [b"", bytes(CanBridge(1, 3, 0x215, (1, 2, 3)))])
+@pytest.mark.parametrize("appended", [b"", bytes(CanBridge(1, 8, 0x215, (1, 2, 3)))])
 @palms
 def test_every_field_is_read_from_its_place(palm: Palm, appended: bytes) -> None:
     status = filled(palm)
