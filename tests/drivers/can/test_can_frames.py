@@ -36,6 +36,7 @@ from tests.drivers.can.can_standin import (
     decoder,
     message,
     sweep_messages,
+    sweep_of_frames,
 )
 from tests.drivers.can.can_words import samples, word
 from tests.drivers.one_sweep import counts_of, tactile
@@ -181,6 +182,15 @@ def test_a_board_that_pads_frames_needs_its_option() -> None:
     assert counters.faulty_readings == 0
 
 
+def test_words_that_are_not_counts_are_told_apart() -> None:
+    made, counters = decoder()
+    frames = sweep_of_frames(0)
+    frames[0] = CanFrame(SAMPLE_ID, E1_SAMPLE[:1] + bytes.fromhex("A250 A52D FFFF"))
+    (reading,) = [reading for at, frame in enumerate(frames) for reading in made.push(frame, at)]
+    assert list(reading.faults[:, 0]) == [4, 8, 1], "PARITY, ERROR_WORD, MISSING"
+    assert (counters.parity_words, counters.error_words, counters.unplugged_words) == (1, 1, 1)
+
+
 @pytest.mark.parametrize("scene", ["all", "interleaved"])
 @pytest.mark.parametrize("board", sorted(SEQUENCES))
 def test_another_sequence_shows_after_twenty_readings(scene: str, board: str) -> None:
@@ -233,12 +243,14 @@ def test_a_package_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> 
         ("remote", r"pip install 'python-can\[remote\]'$"),
         ("gs_usb", r"'gs_usb' needs more packages: run .* -m pip install 'python-can\[gs-usb\]'$"),
         ("slcan", r"pip install 'python-can\[serial\]'$"),
+        ("kvaser", r"needs the library libcanlib\.so"),
     ],
 )
 def test_an_interface_without_its_package_is_refused(
     monkeypatch: pytest.MonkeyPatch, interface: str, says: str
 ) -> None:
     monkeypatch.setattr("graspd.drivers.can.interfaces.find_spec", lambda _name: None)
+    monkeypatch.setattr("graspd.drivers.can.interfaces._has_library", lambda _name: False)
     with pytest.raises(ValueError, match=says):
         CanBridgeDriver(interface, "can0")
 

@@ -12,7 +12,7 @@ import time
 import can
 import pytest
 
-from graspd.drivers.base import TactileReading
+from graspd.drivers.base import DriverError, TactileReading
 from graspd.drivers.can.bus import CanBus
 from graspd.drivers.can.driver import CanBridgeDriver
 from graspd.drivers.link import LinkState
@@ -126,6 +126,15 @@ def test_python_can_gets_bit_rate_and_bounded_queue(
     assert seen["rx_queue_size"] == 16384
     assert seen["bitrate"] == 500_000
     assert seen["ignore_config"] is True
+
+
+def test_a_wrong_argument_is_final_where_it_means_that(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Other interfaces of python-can raise the same for a device that is absent."""
+    stand_in(monkeypatch, lambda: int("no number"))
+    with pytest.raises(DriverError, match="cannot open slcan x: invalid literal"):
+        CanBridgeDriver("slcan", "x").open()
+    with CanBridgeDriver("robotell", "x") as driver:
+        assert driver.stream.link.state is LinkState.WAITING
 
 
 def test_a_silent_board_is_down_and_comes_back(monkeypatch: pytest.MonkeyPatch) -> None:

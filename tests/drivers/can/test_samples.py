@@ -178,12 +178,6 @@ def test_slow_and_fast_boards_are_understood(sequence: str, rate_hz: int) -> Non
     assert sweeps.period_ns == slot_ns * len(SEQUENCES[sequence])
 
 
-def test_a_period_is_learned_though_each_sweep_has_losses() -> None:
-    sweeps, _ = assembler()
-    feed(sweeps, concatenated([samples(n)[:5] + samples(n)[6:] for n in range(6)]))
-    assert sweeps.period_ns == PERIOD_NS
-
-
 @pytest.mark.parametrize(
     ("sweep", "step_ns", "t_ns", "late"),
     [
