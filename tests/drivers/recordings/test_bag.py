@@ -21,7 +21,7 @@ from graspd.biotac import electrode_columns
 from graspd.daemon.cli import main
 from graspd.daemon.publish.messages import Verdict
 from graspd.drivers.base import DriverError, RecordingError, TactileReading
-from graspd.drivers.recordings.bag import SENSOR, TACTILE, BagDriver, fingers_of
+from graspd.drivers.recordings.bag import SENSOR, TACTILE, BagDriver, fingers_of, has_joints
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING
 from tests.drivers.recordings.bags import ABSENT, WITH_ARRAY, BagOf, Sweep
 
@@ -109,7 +109,7 @@ def test_a_bag_is_judged_as_its_stream(
 def test_one_file_of_a_bag_is_read(tmp_path: Path, plugin: StoragePlugin) -> None:
     folder = BagOf(2).write(tmp_path / "hand", noise(30), storage_plugin=plugin)
     (storage,) = (path for path in folder.iterdir() if path.name != "metadata.yaml")
-    assert len(readings_of(storage)) == 30
+    assert [reading.seq for reading in readings_of(storage)] == list(range(30))
     assert len(readings_of(storage.rename(tmp_path / "hand.bin"))) == 30
 
 
@@ -158,6 +158,18 @@ def test_a_repeat_is_dropped_and_counted(
     assert driver.counters.repeats == repeats
 
 
+@pytest.mark.parametrize(("back_ns", "left"), [(900_000_000, 20), (1_000_000_000, 40)])
+def test_a_clock_set_back_by_a_second_repeats_nothing(
+    tmp_path: Path, back_ns: int, left: int
+) -> None:
+    first, sweeps = BagOf(1).write(tmp_path / "1.bag", noise(20)), noise(20, seed=2)
+    later = [each._replace(t_ns=each.t_ns + 19 * PERIOD_NS - back_ns) for each in sweeps]
+    with BagDriver([first, BagOf(1).write(tmp_path / "2.bag", later)], ("ff",)) as driver:
+        while not driver.exhausted:
+            driver.read_ready()
+    assert driver.counters.readings == left
+
+
 def test_stamps_that_stand_still_are_named(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -186,7 +198,7 @@ def test_a_hand_frozen_in_the_topic_is_not_judged(tmp_path: Path) -> None:
 
 def test_absent_sensors_and_values_that_are_not_counts_are_broken(tmp_path: Path) -> None:
     sweeps = noise(30)
-    sweeps[25].electrodes["ff"][:3] = -22072, 32570, 5000
+    sweeps[25].electrodes["ff"][:5] = -1, 4096, 5000, 0, 4095  # a count has 12 bits
     path = BagOf(1).write(tmp_path / "hand.bag", sweeps)
     faulty = readings_of(path)[25].faults
     assert np.argwhere(faulty).tolist() == [[0, 0], [0, 1], [0, 2]]
@@ -266,6 +278,21 @@ def test_a_joint_of_both_hands_has_no_angle(tmp_path: Path) -> None:
     frame = read_recording(path)
     assert frame["FFJ3"].isna().all()
     assert (frame["THJ5"] == 0.7).all()
+
+
+def test_of_two_hands_in_a_bag_the_right_is_played(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    bag, path, sweeps = BagOf(1), tmp_path / "hand.bag", noise(2)
+    with rosbag1.Writer(path) as writer:
+        writer.add_connection("/joint_states", "sensor_msgs/msg/JointState", typestore=bag.store)
+        for hand, sweep in zip(("lh", "rh"), sweeps, strict=True):
+            where = writer.add_connection(f"/{hand}/tactile", TACTILE, typestore=bag.store)
+            writer.write(where, START_NS, bag.store.serialize_ros1(bag.tactile(sweep), TACTILE))
+    (reading,) = readings_of(path)
+    assert (reading.counts[0] == sweeps[1].electrodes["ff"]).all()
+    assert "/lh/tactile is left out" in caplog.text
+    assert not has_joints(path)
 
 
 def test_bags_of_two_hands_are_not_one_run(tmp_path: Path) -> None:

@@ -100,7 +100,9 @@ def test_parquet_reads_as_its_csv_unless_damaged(tmp_path: Path) -> None:
     frame = frame.astype(dict.fromkeys(ELECTRODES, float) | {"slipped": bool})
     path = tmp_path / "grasps"
     frame.to_parquet(path)
-    assert values(list(read_rows(path, FINGERS))) == values(rows_of(PLAIN))
+    rows = list(read_rows(path, FINGERS))
+    assert values(rows) == values(rows_of(PLAIN))
+    assert [row.annotation.line for row in rows] == [2, 3, 4, 5]
     path.write_bytes(path.read_bytes().replace(b"ff_biotac_1", b"\xe3f_biotac_1"))
     with pytest.raises(RecordingError, match="is damaged: 'utf-8' codec can't decode"):
         layout_of(path, FINGERS)
@@ -287,14 +289,20 @@ def test_the_unit_of_times_is_known_by_their_steps(tmp_path: Path, unit_s: float
     place = names.index("t")
     cells[:, place] = [f"{float(value) / unit_s:.0f}" for value in cells[:, place]]
     found = layout_of(write(tmp_path, written(names, cells)), FINGERS)
-    assert (found.is_stream, found.unit_s) == (True, unit_s)
+    assert (found.is_stream, found.unit_s, found.has_outcomes) == (True, unit_s, True)
 
 
-def test_grasps_with_times_a_minute_apart_are_doubted(tmp_path: Path) -> None:
-    header, *lines = DEMO_TABLE.read_text().splitlines()
-    content = "\n".join(["time," + header, *(f"{60 * n},{line}" for n, line in enumerate(lines))])
+@pytest.mark.parametrize(
+    ("time", "apart_s"),
+    [(lambda n: f"{60 * n}", "0.06"), (lambda n: f"{n // 6:02}:{n % 6}0:00", "600")],
+)
+def test_grasps_with_times_minutes_apart_are_doubted(
+    tmp_path: Path, time: Callable[[int], str], apart_s: str
+) -> None:
+    header, *lines = DEMO_TABLE.read_text().splitlines()[:100]
+    content = "\n".join(["time," + header, *(f"{time(n)},{line}" for n, line in enumerate(lines))])
     path = write(tmp_path, content.encode() + b"\n")
-    with pytest.raises(RecordingError, match=r"60 apart: grasps .*--as table.*--as stream"):
+    with pytest.raises(RecordingError, match=rf"grasps .*--as table.* {apart_s} s apart .*--as st"):
         layout_of(path, FINGERS)
     assert not layout_of(path, FINGERS, "table").is_stream
     assert layout_of(path, FINGERS, "stream").is_stream
@@ -302,7 +310,8 @@ def test_grasps_with_times_a_minute_apart_are_doubted(tmp_path: Path) -> None:
 
 def test_a_rate_is_never_ignored(tmp_path: Path) -> None:
     path = write(tmp_path, stream(TIMES))
-    assert layout_of(path, FINGERS, "stream", 50.0).rate_hz == 50.0
+    layout = layout_of(path, FINGERS, "stream", 50.0)
+    assert [row.t_s for row in read_rows(path, FINGERS, layout=layout)] == [0.0, 0.02, 0.04, 0.06]
     with pytest.raises(RecordingError, match="column t: the rows have times: --rate-hz is for"):
         layout_of(path, FINGERS, None, 50.0)
 
@@ -373,12 +382,22 @@ def test_sweeps_with_broken_electrodes_are_never_a_table(
 def test_several_readings_of_each_grasp_are_a_table_if_told(tmp_path: Path) -> None:
     header, *lines = DEMO_TABLE.read_text().splitlines()
     cells = np.array([line.split(",") for line in lines[:40]]).repeat(6, axis=0)
-    noise = np.random.default_rng(2).normal(0.0, 3.0, (240, 72))
+    noise = np.random.default_rng(2).normal(0.0, 5.0, (240, 72))
     cells[:, 2:] = np.round(cells[:, 2:].astype(float) + noise).astype(int)
     content = written(header.split(","), cells)
     with pytest.raises(RecordingError, match="240 of 240 rows nearly repeat another"):
         layout(content, tmp_path)
     assert not layout(content, tmp_path, "table")
+
+
+def test_few_repeated_grasps_are_a_table_if_labelled_or_told(tmp_path: Path) -> None:
+    header, *lines = DEMO_TABLE.read_text().splitlines()
+    labelled = "\n".join([header, *lines[:100], *lines[:8], ""])
+    unknown = labelled.replace("slipped", "x", 1).encode()
+    assert not layout(labelled.encode(), tmp_path)
+    with pytest.raises(RecordingError, match="16 of 108 rows nearly repeat another"):
+        layout(unknown, tmp_path)
+    assert not layout(unknown, tmp_path, "table")
 
 
 @pytest.mark.parametrize(

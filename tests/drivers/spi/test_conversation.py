@@ -124,6 +124,14 @@ def test_a_bridge_that_changes_its_sampling_is_greeted_again() -> None:
     assert conversation.link.reason == "the bridge changed what it samples"
 
 
+def test_a_bridge_whose_clock_stands_is_greeted_again() -> None:
+    conversation = greeted()
+    made = [hear(conversation, sweep(number, 10_000), T0 + 20 * MS) for number in range(2)]
+    assert list(map(len, made)) == [1, 0]
+    assert conversation.link.reason == "the bridge's clock stands or falls back"
+    assert conversation.counters.clock_faults == 1
+
+
 def test_the_last_eight_unanswered_pings_are_remembered() -> None:
     conversation, now_ns = greeted(hello(0, period_ms=1000)), T0
     said(conversation, T0)

@@ -244,6 +244,7 @@ def test_a_flood_is_taken_in_32_reads_of_4096_bytes(monkeypatch: pytest.MonkeyPa
     assert port.reads == [4096] * 32
     assert len(line.read()) == 4096
     assert line.read() == b""
+    assert len(port.reads) == 32 + 2 + 1, "no read after one that found nothing"
 
 
 def test_bytes_before_a_failure_are_handed_over(monkeypatch: pytest.MonkeyPatch) -> None:
