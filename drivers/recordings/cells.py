@@ -112,7 +112,7 @@ class Cells:
         the begin names electrodes, the header is the first line."""
         separator, comment, above, titles = "", "", "", list[tuple[int, str]]()
         header, below = list[str](), list[str]()
-        while not header and len(titles) < TITLE_LINES_MAX and (line := next(lines, "")):
+        while not header and len(titles) <= TITLE_LINES_MAX and (line := next(lines, "")):
             text = line.strip()
             if self.line == 1 and (match := _SEPARATOR_LINE.fullmatch(text)):
                 separator = match[1]

@@ -48,6 +48,7 @@ DIALECTS = {
     "UTF-16 without a mark, big end": PLAIN.decode().encode("utf-16-be"),
     "UTF-32": PLAIN.decode().encode("utf-32"),
     "titles": b"Lab A; run 3\n\nDate:,2026-05-04\n" + PLAIN,
+    "thirty titles": b"Lab A\n\n" * 30 + PLAIN,
     "units below": PLAIN.replace(b"24\n", b"24\n,-" + b",counts" * 72 + b"\n", 1),
     "fingers above": text(
         lambda it: f",,ff{',' * 24}mf{',' * 24}th\n" + re.sub("(ff|mf|th)_biotac_", "e", it)
