@@ -13,7 +13,7 @@ from graspd.drivers.base import JointReading, RecordingError
 from graspd.drivers.can.frames import ERROR, EXTENDED, LOST, REMOTE, CanFrame
 from graspd.drivers.recordings.can_files import read_asc, read_trc
 from graspd.drivers.recordings.can_log import line_of
-from graspd.drivers.recordings.candump import Logged, parse
+from graspd.drivers.recordings.candump import NO_BUS, Logged, parse
 from graspd.drivers.recordings.csv_player import ReplayDriver
 from graspd.drivers.recordings.serial_log import (
     Record,
@@ -124,8 +124,8 @@ ERROR_FRAME = CanFrame(0x80, b"", ERROR)
         ("0.5 2  123x  Rx   r 3", Logged(HALF_NS, "can1", ASKED)),
         ("0.5 1  ErrorFrame", Logged(HALF_NS, "can0", ERROR_FRAME)),
         ("0.5 1  123  Rx   d 3 0D 3A 1F  Length = 0 BitCount = 64", Logged(HALF_NS, "can0", THREE)),
-        ("0.5 CANFD  1 Rx  123  1 0 3  3 0D 3A 1F   0 0 3000 0 0 0", Logged(HALF_NS, "can0", None)),
-        ("0.5 CANFD 1 Rx 123  Name  0 0 3  3 0D 3A 1F  9 8 200000", Logged(HALF_NS, "can0", THREE)),
+        ("0.5 CANFD 1 Rx 123 Name 1 0 3  3 0D 3A 1F  9 8 3000 0 0", Logged(HALF_NS, "can0", None)),
+        ("0.5 CANFD  1 Rx  123  0 0 3  3 0D 3A 1F  9 8 200000", Logged(HALF_NS, "can0", THREE)),
         ("0.5 1  123             Rx   d 3 0D A 1F", None),
         ("0.5 1  FFFFFFFFx       Rx   d 1 00", None),
         ("0.5 1  923             Rx   d 1 00", None),
@@ -141,6 +141,12 @@ def test_lines_of_an_asc_file_are_read(line: str, logged: Logged | None) -> None
 def test_decimal_data_of_an_asc_file_is_read() -> None:
     ((_, _, found),) = read_asc(["base dec  timestamps absolute", "0.5 1 291 Rx d 3 13 58 31"])
     assert found == Logged(HALF_NS, "can0", THREE)
+
+
+def test_other_lines_of_an_asc_file_take_time() -> None:
+    lines = ["base hex  timestamps relative", "0.5 1  Statistic: D 1 R 0"]
+    ((number, _, found),) = read_asc(lines)
+    assert (number, found) == (2, Logged(HALF_NS, NO_BUS, None, may_be_step=True))
 
 
 TRC_2_1 = [";$FILEVERSION=2.1", ";$STARTTIME=0", ";$COLUMNS=N,O,T,B,I,d,R,L,D"]
@@ -165,10 +171,10 @@ DAYS_S = 25569 * 86400
 def test_lines_of_a_trc_file_are_read(
     head: list[str], line: str, frame: CanFrame | str | None
 ) -> None:
-    ((_, _, found),) = read_trc([*head, ";  Message Number", line])
+    ((number, _, found),) = read_trc([*head, ";  Message Number", line])
     at_ns = HALF_NS - (DAYS_S * 10**9 if head == TRC_2_1 else 0)
     logged = Logged(at_ns, "can0", frame if isinstance(frame, CanFrame) else None)
-    assert found == (None if frame is None else logged)
+    assert (number, found) == (len(head) + 2, None if frame is None else logged)
 
 
 records = st.tuples(

@@ -86,13 +86,13 @@ def test_a_sweep_unlike_the_hello_is_bad() -> None:
 
 def test_a_bridge_that_is_started_again_interrupts() -> None:
     counters, interrupted = BridgeCounters(), []
-    for _ in range(2):
+    for sweeps in (1, 3):
         decoder = SweepDecoder(hello(0), (0, 1, 2), counters, DeviceClock(1_000_000, 0, 0, 0))
-        for number in range(3):
+        for number in range(sweeps):
             reading = decoder.reading(sweep(number, number * 10_000), (number + 1) * 10_000_000)
             assert reading is not None
             interrupted.append(reading.interrupted)
-    assert interrupted == [False, False, False, True, False, False]
+    assert interrupted == [False, True, False, False]
 
 
 MS = 1_000_000
@@ -254,6 +254,15 @@ def test_a_rate_wrong_by_500_ppm_is_a_fault(wrong_ppm: int) -> None:
     tick = 11 * TICK_HZ + 10 * wrong_ppm
     clock.round_trip(tick + TICK_HZ, now_ns + S, now_ns + S)
     assert not clock.is_doubted
+
+
+def test_a_clock_that_stood_after_a_short_ping_is_doubted() -> None:
+    clock = DeviceClock(TICK_HZ, TICK_HZ, START_NS, START_NS + 100 * MS)
+    clock.round_trip(2 * TICK_HZ, START_NS + S, START_NS + S)
+    assert not clock.is_doubted
+    late_ns = START_NS + 2 * S + 20 * MS
+    clock.round_trip(3 * TICK_HZ, late_ns, late_ns)
+    assert clock.is_doubted
 
 
 @given(st.floats(-80_000.0, 80_000.0), st.integers(0, 99))
