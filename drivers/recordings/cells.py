@@ -119,11 +119,12 @@ class Cells:
             elif text.startswith("#"):
                 comment = text.lstrip("# ")
             elif text:
-                if _names_fingers(above) and has_electrodes(_merged(_split(above), _split(text))):
+                tops, names = _split(above, separator), _split(text, separator)
+                if _name_fingers(tops) and has_electrodes(_merged(tops, names)):
                     header = [above, line]
-                elif has_electrodes(_split(text)):
+                elif has_electrodes(names):
                     header = [line]
-                elif has_electrodes(_split(comment)):
+                elif has_electrodes(_split(comment, separator)):
                     header, below = [comment], [line]
                 titles.append((self.line, line))
                 above = line
@@ -141,7 +142,7 @@ class Cells:
         for line in lines:
             if self._length == 0 and line.startswith("#"):
                 is_row = separator != " " and line.count(separator) >= number
-                if is_row and not has_electrodes(_split(line.lstrip("# "))):
+                if is_row and not has_electrodes(_split(line.lstrip("# "), separator)):
                     raise self.error(
                         "the line begins with #, as a comment does, and has the cells of a row: "
                         "put its first cell into quotes, or delete it"
@@ -201,12 +202,13 @@ def _separator(header: str) -> str:
     return most if most in header else " "
 
 
-def _split(text: str) -> list[str]:
-    return [cell.strip(' "') for cell in text.strip().split(_separator(text))]
+def _split(text: str, separator: str) -> list[str]:
+    """Return the cells of a header; `separator`: empty if it is not known."""
+    return [cell.strip(' "') for cell in text.strip().split(separator or _separator(text))]
 
 
-def _names_fingers(line: str) -> bool:
-    return not {cell.lower() for cell in _split(line)}.isdisjoint(FINGERS)
+def _name_fingers(cells: Sequence[str]) -> bool:
+    return not {cell.lower() for cell in cells}.isdisjoint(FINGERS)
 
 
 def _merged(above: Sequence[str], names: Sequence[str]) -> list[str]:

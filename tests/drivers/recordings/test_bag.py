@@ -200,8 +200,9 @@ def test_absent_sensors_and_values_that_are_not_counts_are_broken(tmp_path: Path
     sweeps = noise(30)
     sweeps[25].electrodes["ff"][:5] = -1, 4096, 5000, 0, 4095  # a count has 12 bits
     path = BagOf(1).write(tmp_path / "hand.bag", sweeps)
-    faulty = readings_of(path)[25].faults
-    assert np.argwhere(faulty).tolist() == [[0, 0], [0, 1], [0, 2]]
+    reading = readings_of(path)[25]
+    assert reading.counts[0, :5].tolist() == [0, 0, 0, 0, 4095]
+    assert np.argwhere(reading.faults).tolist() == [[0, 0], [0, 1], [0, 2]]
     with pytest.raises(RecordingError, match="no sensor on rf, only on ff, mf, th"):
         readings_of(path, ("ff", "rf"))
 

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from graspd.drivers.base import ElectrodeFault, RecordingError
 from graspd.drivers.recordings.kinds import open_recording
 from graspd.drivers.recordings.layout import survey
-from graspd.drivers.recordings.values import count_of
+from graspd.drivers.recordings.values import count_of, time_of
 from tests.drivers.recordings.tables import (
     ELECTRODES,
     FINGERS,
@@ -143,6 +143,19 @@ def test_an_outcome_that_cannot_be_read_matters_where_needed(label: str) -> None
 def test_a_time_is_a_number_or_a_clock(t: str) -> None:
     with pytest.raises(RecordingError, match=r"line 2, column t: .* is not a time"):
         rows_of(stream([t, "1"]))
+
+
+@pytest.mark.parametrize(
+    ("cell", "t_s"),
+    [
+        ("2023-11-14T22:13:20.5Z", 1_700_000_000.5),
+        ("2023-11-15 00:13:20.5+02:00", 1_700_000_000.5),
+        ("9:05:20,5", 32_720.5),
+        ("2 days 01:02:03", 176_523.0),
+    ],
+)
+def test_a_clock_is_read_in_seconds(cell: str, t_s: float) -> None:
+    assert time_of(cell) == t_s
 
 
 def test_a_line_of_exactly_the_limit_is_read() -> None:
