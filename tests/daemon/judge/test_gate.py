@@ -218,6 +218,7 @@ def test_a_finger_that_need_not_touch_need_not_be_tared() -> None:
         if t_s > 0.7:
             break
     assert hand.tared == FINGERS[:2]
+    assert hand.health() == {FINGERS[2]: Reason.NOT_TARED}
     assert now.settled
 
 

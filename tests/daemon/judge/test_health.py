@@ -220,14 +220,29 @@ def test_a_ring_of_odd_palm_packets_is_never_stable(packets: int) -> None:
     assert stable >= UNDER_RING
 
 
-@pytest.mark.parametrize(("equal", "is_frozen"), [(19, False), (20, True), (23, True)])
-def test_a_sweep_of_twenty_equal_electrodes_comes_again(equal: int, is_frozen: bool) -> None:
+@pytest.mark.parametrize(
+    ("equal", "unread", "is_frozen"),
+    [
+        (19, 0, False),
+        (20, 0, True),
+        (23, 0, True),
+        (12, 7, False),
+        (12, 8, True),
+        (12, 12, True),
+        (11, 13, False),  # fewer than 12 that were read
+    ],
+)
+def test_a_sweep_of_twenty_equal_or_unread_electrodes_comes_again(
+    equal: int, unread: int, is_frozen: bool
+) -> None:
     health, random = Health(len(FINGERS)), np.random.default_rng(4)
     sweeps = random.integers(500, 3500, (9, 3, 24))
     sweeps[8, 1] = sweeps[2, 1]
     sweeps[8, 1, equal:] += 1
     for counts in sweeps:
-        checked = health.check(sound(counts))
+        reading = sound(counts)
+        reading.faults[1, equal : equal + unread] = ElectrodeFault.PARITY
+        checked = health.check(reading)
     assert (Reason.FROZEN in checked.reasons) == is_frozen
 
 
