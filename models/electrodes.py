@@ -154,7 +154,8 @@ class Electrodes:
         """Return `broken` and the electrodes that do not fit the others, shape (fingers, 24).
 
         Deviations of `broken` are ignored. The worst electrode is removed first and the rest
-        checked again, until all fit or `at_most` are broken.
+        checked again, until all fit or `at_most` electrodes of the hand, with those of `broken`,
+        are marked.
         """
         bad, residuals = broken.ravel(), deviations.residuals
         if 1 in broken.tobytes():

@@ -78,8 +78,8 @@ class TactileImager(InputBuilder):
     """Build normalised tactile images without allocating an image per reading.
 
     The arithmetic is float64 on integers below 2**12, and the mean is subtracted from each pixel
-    before squaring. An image differs from the exact one by less than 1e-9, and then by rounding to
-    float32: 6e-8 of its largest magnitude.
+    before squaring. The error of an image is below 1e-9 of its largest magnitude, and after
+    rounding to float32 6e-8 of it.
     """
 
     name = "tactile_image"

@@ -199,7 +199,7 @@ class Conversation:
         return encode(Ping(self._nonce))
 
     def _has_our_layout(self, payload: bytes, now_ns: int) -> bool:
-        """Return True if a HELLO has our version and layout; else close the link."""
+        """Return False and close the link if `payload` is a HELLO of another version or layout."""
         layout = layout_of(payload)
         if layout is None or layout == (VERSION, DIGEST):
             return True

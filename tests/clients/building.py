@@ -52,9 +52,10 @@ def compiled(name: str) -> Path:
 
 
 def kept(command: Callable[[Path], Words], name: str) -> Path:
-    """The program that `command` makes in the folder that it is given, or did of the same sources.
+    """The program `name`, which `command` makes in the folder that it is given.
 
-    Four seconds of a processor for one, so processes that run tests wait for the first of them.
+    It is kept as long as sources and compiler stay the same. One process makes it, in four
+    seconds, while others wait.
     """
     sources = [
         *CPP.glob("*.?pp"),

@@ -113,7 +113,7 @@ def test_lifts_are_remembered_in_bounded_memory(monkeypatch: pytest.MonkeyPatch)
         assert len(graspd._lifts) == 4  # noqa: SLF001
 
 
-def test_an_outcome_that_waits_for_the_disk_blocks_no_lift() -> None:
+def test_an_outcome_waiting_for_the_disk_blocks_no_lift() -> None:
     world = grasps(9)
     world.acknowledged[:] = [(1000 * MS, TAKEN)]
     with client(world, ask=True) as graspd:

@@ -98,7 +98,9 @@ def test_the_readmes_program_lifts_nothing_without_an_answer(prefix: Path, proje
     }
 
 
-def test_another_minor_version_is_not_mistaken_for_this_one(prefix: Path, project: Path) -> None:
+def test_a_project_for_another_minor_version_refuses_this_package(
+    prefix: Path, project: Path
+) -> None:
     lines = "\n".join(block("cmake", "cmake_minimum")).replace("0.1", "0.2")
     (project / "CMakeLists.txt").write_text(lines)
     found = subprocess.run(

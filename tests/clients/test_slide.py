@@ -109,7 +109,7 @@ def test_in_cpp_a_lift_is_stopped_for_the_same_reasons(
     passes: bool,
     answer: str,
 ) -> None:
-    """`passes`: it is over when the client looks again."""
+    """`passes`: the fingers hold again before the client looks."""
     fingers = dict(HELD)
     with (
         false_daemon(tmp_path, outcome="unknown", fingers=fingers),

@@ -59,7 +59,7 @@ class Started(subprocess.Popen[str]):
 
 
 def graspd_with(module: str, **constants: object) -> tuple[str, ...]:
-    """The command `graspd`, with other constants of a module."""
+    """Words that start `graspd` with these values for constants of the module named `module`."""
     return (sys.executable, "-c", WITH_CONSTANTS, f"{module}:{constants!r}")
 
 

@@ -67,7 +67,7 @@ def test_a_session_of_earlier_grasps_is_that_of_a_replay(counts: NDArray[np.floa
         assert got[0, 1] == said[40]["p_slip"]
 
 
-def test_an_electrode_at_a_rail_is_repaired_as_live(
+def test_predict_proba_repairs_a_railed_electrode_as_judge_does(
     counts: NDArray[np.float64],
 ) -> None:
     railed = counts[:12].copy()

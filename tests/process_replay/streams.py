@@ -95,7 +95,7 @@ def can(log: BinaryIO | None = None) -> Iterator[Reading]:
 
 
 def palm() -> Iterator[Reading]:
-    """Play the same grasps from a palm twin, one packet a millisecond, with calibrated joints."""
+    """Play the demo's grasps from a palm twin, one packet a millisecond, with calibrated joints."""
     calibration = CHECKOUT / "deploy" / "calibration" / "example_hand.toml"
     stream = PalmStream(FINGERS, calibration=calibration)
     t_ns = START_NS
@@ -106,7 +106,7 @@ def palm() -> Iterator[Reading]:
 
 
 def spi(log: BinaryIO | None = None) -> Iterator[Reading]:
-    """Play the same grasps from an SPI bridge; write the bytes to `log`, as a serial link log."""
+    """Play the demo's grasps from an SPI bridge; write its bytes to `log`, a serial link log."""
     line = _Line(log)
     for sequence, counts in enumerate(_counts()):
         now_ns = START_NS + PERIOD_NS * sequence

@@ -1164,9 +1164,9 @@ private:
         return anything_new;
     }
 
-    // What came or waits since before a sleep of the computer, or a long time without a look; when
-    // a message or a connection came last. While the computer sleeps the monotonic clock
-    // stands still: all would look fresh.
+    // Forgets the newest message after a sleep of the computer, during which the monotonic clock
+    // stands still. Reconnects then, and after a long time without reading. Returns when the last
+    // message or connection came, ns.
     Nanoseconds forget_what_is_old() {
         const Nanoseconds slept_ns = detail::slept_ns();
         const bool slept = slept_ns - slept_ns_ > SLEPT_NS;

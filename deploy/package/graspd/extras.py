@@ -10,7 +10,10 @@ from pathlib import Path
 
 
 def require(package: str, what: str, extra: str) -> None:
-    """Raise `ModuleNotFoundError`, with advice, if `what` lacks a package of `extra`."""
+    """Raise `ModuleNotFoundError` if `package`, which `what` needs, is missing.
+
+    The message says how to install `extra`.
+    """
     try:
         import_module(package)
     except ModuleNotFoundError as error:

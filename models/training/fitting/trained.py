@@ -109,7 +109,10 @@ def train(system: System, grasps: Grasps, seed: int) -> Trained:
 
 
 def _sensor_standards(counts: Numbers, table_of: Ints) -> TrainingStandards:
-    """Return the standards of counts (N, fingers, 24); the prior is the mean of the tables."""
+    """Return the standards of counts (N, fingers, 24), by table.
+
+    The mean of the prior is the mean of the tables' means.
+    """
     tables = TrainingStandards.of(counts.reshape(len(counts), -1).astype(np.float64), table_of)
     centre = np.mean([table.mean for table in tables.tables.values()], axis=0)
     return replace(tables, prior=Standards(centre, tables.prior.spread))

@@ -68,7 +68,7 @@ def test_data_that_was_changed_is_refused(mirror: tuple[Path, str], tmp_path: Pa
 
 @contextmanager
 def served(answer: Callable[[socket.socket], None]) -> Iterator[str]:
-    """Address of a server that treats its one client like that."""
+    """Address of an HTTP server that calls `answer` with the socket of its one client."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
 
         def serve() -> None:

@@ -250,7 +250,7 @@ def first_message(publisher: Publisher, subscriber: zmq.Socket[bytes]) -> list[b
 
 @contextmanager
 def opened_door(folder: Path, mode: int | None = None) -> Iterator[tuple[Door, str]]:
-    """A door with sockets `v` for messages and `ask` for questions, and the endpoint of that."""
+    """A door with sockets `v` for messages and `ask` for questions; the endpoint of `ask`."""
     listeners = [Listener(f"ipc://{folder}/{name}", mode) for name in ("v", "ask")]
     door = Door(listeners)
     yield door, listeners[1].endpoint

@@ -96,7 +96,7 @@ def test_an_untrusted_folder_admits_no_key(door: KeyedDoor) -> None:
     assert door.hears(door.connect(door.known), PATIENCE_S)
 
 
-def test_keys_behind_a_folder_open_to_all_are_refused(tmp_path: Path) -> None:
+def test_keys_reached_through_a_folder_open_to_all_are_refused(tmp_path: Path) -> None:
     make(tmp_path / "clients", "laptop")
     (tmp_path / "way").mkdir()
     (tmp_path / "way" / "clients").symlink_to("../clients")

@@ -78,7 +78,7 @@ def test_the_committed_schema_is_the_one_of_the_code() -> None:
     jsonschema.Draft202012Validator.check_schema(schema())
 
 
-def test_a_probability_that_is_not_a_number_never_goes_out() -> None:
+def test_a_probability_that_is_not_a_number_becomes_null() -> None:
     broken = msgspec.structs.replace(golden("verdict_unknown"), p_slip=math.nan)
     assert json.loads(encode(broken))["p_slip"] is None
 

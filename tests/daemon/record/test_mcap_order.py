@@ -154,7 +154,7 @@ LINES: dict[str, tuple[str, object]] = {
         (("tactile", "stale", "dropped", "tactile", "stable"), False, [True, False]),
     ],
 )
-def test_a_reading_before_a_loss_is_late_without_a_verdict(
+def test_an_unjudged_reading_before_a_loss_is_played_as_late(
     tmp_path: Path, recorded: tuple[str, ...], is_cut: bool, called_late: list[bool]
 ) -> None:
     path = tmp_path / "a.mcap"

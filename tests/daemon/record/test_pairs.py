@@ -37,7 +37,7 @@ def test_every_reader_takes_what_a_writer_makes(
     assert not layout_of(path, ("ff", "mf", "th")).is_stream
 
 
-def test_a_stream_that_the_library_writes_is_a_stream(tmp_path: Path) -> None:
+def test_a_stream_written_by_pandas_is_read_back(tmp_path: Path) -> None:
     frame = read_recording(DEMO_RECORDING)
     frame.iloc[:300].to_csv(tmp_path / "stream", index=False)
     frame.iloc[:300].to_parquet(tmp_path / "parquet")

@@ -216,7 +216,7 @@ def test_a_sensor_frozen_among_skipped_readings_is_never_stable() -> None:
     assert Decision.STABLE in {verdict.verdict for verdict, _ in bench.judged}
 
 
-def test_a_repeated_finger_is_held_despite_flagged_electrodes() -> None:
+def test_an_unchanged_finger_is_marked_held_except_its_flagged_electrodes() -> None:
     """A flagged electrode does not count as different from the former sweep."""
     former, newest = reading(START_NS, 1, 1), reading(START_NS + PERIOD_NS, 2, 2)
     counts = newest.counts.copy()

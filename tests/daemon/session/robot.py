@@ -88,7 +88,7 @@ class Day:
         self._order = np.random.default_rng(0).permutation(len(self.grasps))
 
     def stream(self, start: int, number: int) -> WholeGrasps:
-        """Grasps in random order, with measured noise and rests between them."""
+        """`number` grasps from place `start` of a fixed random order, with noise and rests."""
         chosen = self._order[start : start + number].tolist()
         ends = [EndPoint(self.grasps[row], bool(self.slipped[row]), "object") for row in chosen]
         return WholeGrasps(rest_above(self.grasps), ends, rate_hz=RATE_HZ, durations=SHORT)

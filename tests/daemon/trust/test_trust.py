@@ -57,7 +57,7 @@ def test_stable_cannot_be_noted_where_it_was_not_allowed() -> None:
             part.note(named(0), assessment, stable=True)
 
 
-def test_what_was_permitted_and_not_said_is_asked_again() -> None:
+def test_an_allowed_grasp_is_reviewed_before_it_is_called_stable() -> None:
     part, names = trust(RiskLimits(0.05)), list(map(named, range(30)))
     early = [part.judge(name, 1e-6, -13.8, inputs(0)) for name in names]
     assert {each.permission for each in early} == {Permission.ALLOWED}

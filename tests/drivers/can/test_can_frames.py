@@ -53,7 +53,7 @@ def dbc() -> Database:
     return loaded
 
 
-def test_the_real_formats_sample_is_read_and_written() -> None:
+def test_a_sample_of_three_sensors_is_encoded_and_accepted() -> None:
     assert encode_sample(17, word(2602) + word(2713) + word(2391)) == E1_SAMPLE
     made, counters = decoder()
     made.push(CanFrame(0x100, E1_SAMPLE), 0)

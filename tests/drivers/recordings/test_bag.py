@@ -308,7 +308,7 @@ def test_bags_of_two_hands_are_not_one_run(tmp_path: Path) -> None:
             driver.read_ready()
 
 
-def test_a_bag_without_the_topic_or_as_a_table_is_refused(
+def test_a_bag_without_topic_or_with_gate_every_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bag = BagOf(1)

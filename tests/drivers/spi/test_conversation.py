@@ -132,7 +132,7 @@ def test_a_bridge_whose_clock_stands_is_greeted_again() -> None:
     assert conversation.counters.clock_faults == 1
 
 
-def test_the_last_eight_unanswered_pings_are_remembered() -> None:
+def test_at_most_eight_unanswered_pings_are_remembered() -> None:
     conversation, now_ns = greeted(hello(0, period_ms=1000)), T0
     said(conversation, T0)
     for _ in range(8):

@@ -212,7 +212,7 @@ def test_the_layout_of_a_later_version_can_be_read() -> None:
     assert layout_of(later[:4]) is None
 
 
-def test_an_odd_serial_number_breaks_no_hello() -> None:
+def test_strange_bytes_in_a_serial_number_break_no_hello() -> None:
     payload = bytearray(HELLO.to_bytes())
     start = payload.index(b"BTSP")
     payload[start : start + 5] = b"B\xff\n\x80P"

@@ -53,7 +53,9 @@ def test_a_session_is_calibrated_after_the_grasps_of_its_card(
 
 
 @pytest.mark.parametrize("spread", [SPREAD, 1.0], ids=["far away", "standing still"])
-def test_what_cannot_have_been_grasps_is_never_calibrated_nor_sharp(spread: float) -> None:
+def test_impossible_grasps_never_calibrate_a_session_nor_lower_its_temperature(
+    spread: float,
+) -> None:
     session = new_session()
     for counts in grasps(50, 3200.0 if spread == SPREAD else MEAN, spread):
         session.observe(counts)

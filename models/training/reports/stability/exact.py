@@ -129,9 +129,10 @@ def exact_softening(
     temperature: float,
     threshold: float,
 ) -> NDArray[np.float64]:
-    """Return the probability of slip in a young session: the margin divided by the temperature.
+    """Return the probability of slip in a young session.
 
-    The margin counts from the threshold; probabilities are at least `TINY`.
+    The distance of the log odds from those of the threshold is divided by the temperature.
+    Probabilities that are passed count as at least `TINY`.
     """
     slip = np.maximum(p_slip, TINY).astype(np.longdouble)
     stable = np.maximum(p_stable, TINY).astype(np.longdouble)

@@ -179,7 +179,7 @@ def test_a_grasp_that_is_in_two_tables_is_refused(tmp_path: Path) -> None:
         assert refusal([monday, both], data) == f"{both}: {said}"
 
 
-def test_two_lab_tables_have_two_names(tmp_path: Path) -> None:
+def test_two_lab_tables_of_one_name_are_refused(tmp_path: Path) -> None:
     paths = [tmp_path / day / "lab.csv" for day in ("monday", "friday")]
     for seed, path in enumerate(paths):
         path.parent.mkdir()

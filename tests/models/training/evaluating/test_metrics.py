@@ -53,7 +53,7 @@ def test_differences_of_overlapping_trainings_are_less_sure_than_they_look() -> 
 
 
 def right_of(*objects: list[int]) -> tuple[pd.Series, pd.Series, pd.Series]:
-    """Verdicts by object, 1 where right: what is right, of what, and the objects."""
+    """Arguments of `interval`, a row per verdict: 1 if right, 1, number of its object."""
     names = np.repeat(np.arange(len(objects)), [len(verdicts) for verdicts in objects])
     right = pd.Series(np.concatenate(objects))
     return right, pd.Series(np.ones(len(right))), pd.Series(names)
