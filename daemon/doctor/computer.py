@@ -174,13 +174,21 @@ def port_holders(protocol: str, port: int) -> list[Process]:
 def _with_open(files: Collection[object]) -> set[int]:
     """Return ids of processes with one of these files (device, inode) or sockets (inode) open."""
     pids = set()
-    for descriptor in PROC.glob("[0-9]*/fd/*"):
-        with suppress(OSError):
-            opened = descriptor.stat()
-            is_socket = stat.S_ISSOCK(opened.st_mode)
-            if (opened.st_ino if is_socket else _identity(opened)) in files:
-                pids.add(int(descriptor.parts[-3]))
+    for process in PROC.glob("[0-9]*"):
+        with suppress(OSError):  # the process may end meanwhile, or be another user's
+            for descriptor in os.listdir(process / "fd"):
+                if _is_open(process / "fd" / descriptor, files):
+                    pids.add(int(process.name))
     return pids
+
+
+def _is_open(descriptor: Path, files: Collection[object]) -> bool:
+    try:
+        opened = descriptor.stat()
+    except OSError:  # closed meanwhile
+        return False
+    is_socket = stat.S_ISSOCK(opened.st_mode)
+    return (opened.st_ino if is_socket else _identity(opened)) in files
 
 
 def _identity(file: os.stat_result) -> tuple[int, int]:

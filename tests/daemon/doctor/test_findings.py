@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import pkgutil
 import re
+import socket
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -282,3 +285,28 @@ def test_what_the_kernel_says_of_controllers_is_read(tmp_path: Path) -> None:
     assert [interface.is_down for interface in found] == [False, True, False]
     without = computer.can_interfaces(tmp_path / "net", ("no-such-command",))
     assert [interface.state for interface in without] == ["up", "down", "up"]
+
+
+def test_a_process_that_ends_meanwhile_hides_no_holder_of_a_port(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Processes of `/proc`: 8 ends while it is looked at, 9 has the socket of port 8080."""
+    for pid in "89":
+        (tmp_path / pid / "fd").mkdir(parents=True)
+    (tmp_path / "9" / "cmdline").write_bytes(b"other\0program\0")
+    (tmp_path / "net").mkdir()
+    with socket.socket(socket.AF_UNIX) as held:
+        held.bind(str(tmp_path / "9" / "fd" / "3"))
+        inode = (tmp_path / "9" / "fd" / "3").stat().st_ino
+        line = f"0: 0100007F:1F90 00000000:0000 07 0:0 00:0 0 0 0 {inode} 2 0 0"
+        (tmp_path / "net" / "udp").write_text(f"header\n{line}\n")
+        monkeypatch.setattr(computer, "PROC", tmp_path)
+        for name in ("listdir", "scandir"):
+            monkeypatch.setattr(os, name, partial(_unless_ended, getattr(os, name)))
+        assert computer.port_holders("udp", 8080) == [computer.Process(9, "other program")]
+
+
+def _unless_ended(listed: Callable[[object], object], folder: object) -> object:
+    if str(folder).endswith("8/fd"):
+        raise FileNotFoundError(folder)
+    return listed(folder)
