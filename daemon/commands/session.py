@@ -138,8 +138,7 @@ def _readable(found: Found) -> dict[int, KeptSession]:
 def _continued(
     wanted: scene.Scene, model: TactileModel, sessions: dict[int, KeptSession]
 ) -> tuple[dict[int, KeptSession], bool]:
-    """Return the sessions, and True if the daemon would start calibrated. The sessions that a start
-    would continue come first."""
+    """Return the sessions, those that a start continues first; True if it would be calibrated."""
     pipeline = assembly.build_pipeline(Plan.of(wanted), model)
     fingers, kept = tuple(wanted.hand.fingers), list(sessions.values())
     used, learned, problems = continue_kept(pipeline, fingers, newest_of_each(kept))
@@ -303,11 +302,8 @@ def _restored_lifts(trust: Trust, kept: KeptSession, path: Path) -> dict[str, Li
 
 
 def _taught(trust: Trust, *, proves: bool) -> TrustState:
-    """Return the state learned from recorded outcomes, without their lifts.
-
-    The bound of `[risk]` counts only lifts of `stable` verdicts, which these were not. `proves`:
-    True if the outcomes count for the warm-up.
-    """
+    """Return the state learned from recorded outcomes. `proves`: they count for the warm-up.
+    Their lifts are left out: the bound of `[risk]` counts only those of `stable` verdicts."""
     state = trust.state()
     risk = replace(state.risk, lifts=0, slips=0, proven=state.risk.proven if proves else 0)
     return replace(state, risk=risk, lifts=LiftBook().state())

@@ -111,8 +111,7 @@ class StepRing:
         self.first = 0
         """Index of the oldest entry in `steps`."""
         self.usable_since_ns = np.zeros(shape, dtype=np.int64)
-        """Time since which each electrode is usable, ns; gaps of up to `LOST_MAX` sweeps are
-        ignored."""
+        """Time since which each electrode is usable, ns, apart from gaps of `LOST_MAX` sweeps."""
         self.sweeps = 0
         """Number of sweeps in the unfinished step."""
         self.crowded = False
@@ -195,8 +194,7 @@ class StepRing:
     def mean(self, values: NDArray[np.float32], begin: int) -> list[float]:
         """Return each finger's mean over its electrodes usable since step `begin`.
 
-        It is infinite for a finger with fewer than `SOUND_MIN` of them. `values`: shape
-        (fingers * 24,).
+        Infinite: fewer than `SOUND_MIN` of them. `values`: shape (fingers * 24,).
         """
         values, since_ns = values.reshape(self._total.shape), self.times_ns[begin]
         if self._all_usable_since_ns <= since_ns:
@@ -265,8 +263,7 @@ class NoiseBlocks:
             sums += ((np.square(differences) * usable) @ ONES / numbers).sum(axis=0)
 
     def noise(self) -> Noise:
-        """Return the motion that noise alone seems to show. Call it with at least `BLOCKS_MIN`
-        blocks."""
+        """Return the motion that noise alone seems to show, from `BLOCKS_MIN` blocks or more."""
         if self._noise is None:
             number = min(self.number, BLOCKS)
             squares = np.sort(self._blocks[:number], axis=0)[number // 4]
