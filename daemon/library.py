@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from graspd.biotac import Finger
+from graspd.biotac import FINGERS, Finger
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Assembly, Parts
 from graspd.daemon.assembly.plan import require_mcap
@@ -27,13 +27,13 @@ from graspd.daemon.run.unjudged import Unjudged
 from graspd.daemon.scene import SceneError
 from graspd.daemon.session import file as session_file
 from graspd.drivers.base import JointReading, RecordingError
-from graspd.drivers.recordings.columns import OBJECT, SLIPPED, time_column
+from graspd.drivers.recordings.columns import OBJECT, ONE_ROW, SLIPPED, finger_column, time_column
 from graspd.drivers.recordings.kinds import Kind, files_of, kind_of_all, refuse_options
 from graspd.drivers.recordings.layout import BLOCK_ROWS, ReadAs, are_labelled, problem_of_sweeps
 from graspd.drivers.recordings.values import BLANK
 from graspd.models import trial, zoo
 from graspd.models.contract import CLASSES, ModelError, SessionInput
-from graspd.models.counts import check_fingers, column_names, counts_of, write_csv
+from graspd.models.counts import check_fingers, column_names, counts_of, fingers_of, write_csv
 from graspd.models.judge.grasp_judge import Examined, GraspJudge
 from graspd.models.runtime import read
 
@@ -174,13 +174,25 @@ def _grasps(
             "not grasps; graspd.judge(table) judges it"
         )
     counts = counts_of(given, fingers)
-    if column_names(given):
+    if names := column_names(given):
+        _refuse_fingers_by_row(given, names)
         rows = counts.reshape(-1, counts.shape[1] * counts.shape[2])
         blocks = np.array_split(rows, range(BLOCK_ROWS, len(rows), BLOCK_ROWS))
         problem = problem_of_sweeps(blocks, read_as, labelled=_are_labelled(given))
         if problem is not None:
             raise ValueError(f"the table: {_in_arguments(problem)} (graspd.judge judges sweeps)")
     return counts
+
+
+def _refuse_fingers_by_row(table: Any, names: Sequence[str]) -> None:  # noqa: ANN401
+    """Raise `ValueError` if the columns have electrodes of one finger, and the rows name more."""
+    column = finger_column(names)
+    if column is None or len(fingers_of(names)) > 1:
+        return
+    cells = np.asarray(table[column[1]], dtype=object).tolist()
+    named = sorted({str(cell).strip().lower() for cell in cells}.intersection(FINGERS))
+    if len(named) > 1:
+        raise ValueError(f"the column {column[1]}: has rows of {' and of '.join(named)}: {ONE_ROW}")
 
 
 def _are_labelled(table: Any) -> bool:  # noqa: ANN401

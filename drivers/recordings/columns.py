@@ -154,7 +154,7 @@ class Columns:
             slipped=single.get(SLIPPED),
             ignored=tuple(name for place, name in enumerate(names) if place not in known),
             fingers=every,
-            finger=_finger_column(names) if len(every) == 1 else None,
+            finger=finger_column(names) if len(every) == 1 else None,
             names_finger=not any(map(SCHEMES["E1"].fullmatch, plain)),
         )
 
@@ -197,7 +197,7 @@ def _electrodes(
                 _refuse_twice(path, names, line, numbers.get(number), place)
                 numbers[number] = place
         if found:
-            return _whole(path, example, found, fingers, line, _finger_column(names))
+            return _whole(path, example, found, fingers, line, finger_column(names))
     if are_numbers(names):
         raise RecordingError(
             path, "has numbers in place of names: the header is missing", line=line
@@ -262,7 +262,8 @@ def _whole(
     }
 
 
-def _finger_column(names: Sequence[str]) -> tuple[int, str] | None:
+def finger_column(names: Sequence[str]) -> tuple[int, str] | None:
+    """Return place and name of the first column that may say of which finger a row is."""
     found = ((place, name) for place, name in enumerate(names) if _OF_A_FINGER.fullmatch(name))
     return next(found, None)
 

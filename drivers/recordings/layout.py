@@ -125,6 +125,7 @@ def survey(
             problem = "the rows have times: --rate-hz is for --as stream, which leaves them out"
             raise RecordingError(path, problem, column=columns.time.name)
         rows.refuse_degrees()
+        rows.refuse_fingers_below()
         if columns.time is None or rate_hz is not None:
             layout = Layout(columns, is_stream=True, rate_hz=rate_hz)
         else:
@@ -133,7 +134,7 @@ def survey(
         repeats = problem_of_sweeps(rows.blocks(), read_as, labelled=rows.are_labelled())
         if repeats is not None:
             raise RecordingError(path, repeats)
-        rows.refuse_fingers_by_row()
+        rows.refuse_fingers_below()
         layout = Layout(columns, is_stream=False)
     file.seek(0)
     return replace(layout, has_outcomes=rows.has_outcomes(layout))
@@ -178,6 +179,13 @@ class _Rows:
             one, other = sorted(self._named)[:2]
             problem = f"has rows of {one} and of {other}: {ONE_ROW}"
             raise RecordingError(self.path, problem, column=self.columns.finger[1])
+
+    def refuse_fingers_below(self) -> None:
+        """Read on to the end, if a column may name fingers, and raise if there are several."""
+        if self.columns.finger is not None:
+            while cells := list(islice(self._others, BLOCK_ROWS)):
+                self._note_fingers(cells)
+            self.refuse_fingers_by_row()
 
     def refuse_degrees(self) -> None:
         """Raise if over a tenth of a joint's angles are, as radians, beyond every joint's reach."""

@@ -108,6 +108,18 @@ def test_sweeps_without_times_are_never_grasps() -> None:
     assert len(model.predict(again, read_as="table")) == 2
 
 
+def test_rows_of_a_finger_each_are_not_grasps(counts: NDArray[np.float64]) -> None:
+    names = [f"ff_biotac_{place}" for place in range(1, 25)]
+    table = dict(zip(names, counts[:2, 0].T, strict=True))
+    of_one: Any = {**table, "finger": ["ff", "FF "]}
+    of_two: Any = {**table, "finger": ["ff", "th"]}
+    model = graspd.load("small-session", fingers=["ff"])
+    with pytest.warns(UserWarning, match="does not know the sensors"):
+        assert len(model.predict(of_one, read_as="table")) == 2
+    with pytest.raises(ValueError, match="column finger: has rows of ff and of th: put all"):
+        model.predict(of_two, read_as="table")
+
+
 @pytest.mark.parametrize(
     ("given", "words"),
     [

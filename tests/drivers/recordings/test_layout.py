@@ -13,10 +13,11 @@ import pytest
 
 from graspd.drivers.base import RecordingError
 from graspd.drivers.recordings.csv_rows import Row, read_rows
-from graspd.drivers.recordings.layout import layout_of
+from graspd.drivers.recordings.layout import layout_of, survey
 from tests.drivers.recordings.tables import (
     ELECTRODES,
     FINGERS,
+    PATH,
     refusal,
     rows_of,
     stream,
@@ -167,6 +168,10 @@ def test_rows_of_a_finger_each_are_not_of_one_finger(name: str, block: int) -> N
     assert "ff has 19 electrodes: a BioTac" in said
     of_one = content.replace("th,", "ff,").encode()
     assert len(rows_of(of_one, ["ff"])) == 2 * block
+    timed = "\n".join([f"t,{header}", *(f"{0.01 * n},{row}" for n, row in enumerate(rows)), ""])
+    for given, rate_hz in ((content, 100.0), (timed, None)):
+        with pytest.raises(RecordingError, match=f"column {name}: has rows of ff and of th"):
+            survey(PATH, io.BytesIO(given.encode()), ["ff"], "stream", rate_hz)
 
 
 @pytest.mark.parametrize(
