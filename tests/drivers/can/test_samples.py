@@ -57,6 +57,15 @@ def test_a_late_sample_is_put_in_its_place_or_flagged(at: int, distance: int) ->
     assert all(not reading.faults.any() for n, reading in enumerate(readings) if n != 6)
 
 
+def test_a_cut_is_counted_if_a_sample_came_before() -> None:
+    sweeps, counters = assembler()
+    sweeps.cut()
+    assert counters.cut_sweeps == 0
+    feed(sweeps, samples(0)[:1])
+    sweeps.cut()
+    assert counters.cut_sweeps == 1
+
+
 def test_channels_that_the_sequence_lacks_are_counted() -> None:
     sweeps, counters = assembler("electrodes")
     stream = samples(0)

@@ -113,6 +113,17 @@ def test_one_file_of_a_bag_is_read(tmp_path: Path, plugin: StoragePlugin) -> Non
     assert len(readings_of(storage.rename(tmp_path / "hand.bin"))) == 30
 
 
+def test_a_sensor_that_starts_late_is_read(tmp_path: Path) -> None:
+    sweeps = noise(30)
+    sweeps[0].electrodes["th"] = ABSENT
+    path = BagOf(1).write(tmp_path / "hand.bag", sweeps)
+    assert fingers_of(path) == ("ff", "mf", "th")
+    with BagDriver([path], ("ff", "mf", "th")) as driver:
+        while not driver.exhausted:
+            driver.read_ready()
+        assert driver.period_ns == PERIOD_NS
+
+
 @pytest.mark.parametrize(
     ("version", "options", "packing"),
     [
@@ -294,6 +305,19 @@ def test_of_two_hands_in_a_bag_the_right_is_played(
     assert (reading.counts[0] == sweeps[1].electrodes["ff"]).all()
     assert "/lh/tactile is left out" in caplog.text
     assert not has_joints(path)
+
+
+def test_joints_are_read_from_the_topic_of_that_name(tmp_path: Path) -> None:
+    bag, path, kind = BagOf(1), tmp_path / "hand.bag", "sensor_msgs/msg/JointState"
+    with rosbag1.Writer(path) as writer:
+        for topic, angle in (("/rh/j", 0.6), ("/joint_states", 0.5), ("/j", 0.7)):
+            joints = bag.joints(START_NS - PERIOD_NS, {"rh_FFJ3": angle})
+            where = writer.add_connection(topic, kind, typestore=bag.store)
+            writer.write(where, START_NS - PERIOD_NS, bag.store.serialize_ros1(joints, kind))
+        where = writer.add_connection("/rh/tactile", TACTILE, typestore=bag.store)
+        sweep = bag.tactile(noise(1)[0])
+        writer.write(where, START_NS, bag.store.serialize_ros1(sweep, TACTILE))
+    assert read_recording(path)["FFJ3"].tolist() == [0.5]
 
 
 def test_bags_of_two_hands_are_not_one_run(tmp_path: Path) -> None:

@@ -67,6 +67,7 @@ def test_what_python_can_writes_plays_as_it_was(
     steps_ns = {b.made_ns - a.made_ns for a, b in pairwise(readings)}
     assert max(abs(step_ns - 24 * STEP_NS) for step_ns in steps_ns) < 1000
     assert log.stream.counters.frames == 9 * 24
+    assert log.period_ns == pytest.approx(24 * STEP_NS, abs=1000)
     assert "understood" not in caplog.text
 
 
@@ -208,10 +209,12 @@ def asc(times_ns: Sequence[int]) -> str:
 
 @pytest.mark.parametrize("written", [shown, asc])
 @pytest.mark.parametrize("is_step", [True, False])
+@pytest.mark.parametrize("same", [1, 3])
 def test_times_since_the_last_frame_are_recognised(
-    tmp_path: Path, is_step: bool, written: Callable[[Sequence[int]], str]
+    tmp_path: Path, is_step: bool, same: int, written: Callable[[Sequence[int]], str]
 ) -> None:
-    times_ns = [at * STEP_NS + at % 3 * 90_000 for at in range(24 * 9)]
+    """`same`: number of frames in a row that have the time of their first."""
+    times_ns = [(at - at % same) * STEP_NS + at % 3 // same * 90_000 for at in range(24 * 9)]
     steps_ns = [0, *(b - a for a, b in pairwise(times_ns))]
     path = tmp_path / "shown.txt"
     path.write_text(written(steps_ns if is_step else times_ns))

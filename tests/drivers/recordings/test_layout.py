@@ -225,6 +225,7 @@ def test_a_row_with_an_electrode_is_not_a_header(content: bytes) -> None:
         ),
         (lambda f, n: f"{f}_e{n}" if (f, n) != ("mf", 7) else "x", "column mf_e7: this column is"),
         (lambda f, n: f"{f}_e{n - (f == 'ff')}", "column mf_e0: this column is missing"),
+        (lambda f, n: f"{f}_e{n + 1}", "column ff_e1: this column is missing"),
         (lambda f, n: f"{f}_e{n}" if f != "th" else f"x{n}", "the file has the fingers ff, mf"),
     ],
 )

@@ -56,6 +56,7 @@ AT_NS = 1_436_509_052_249_713_000
         ("(1436509052.249713) can0 123#0d3a1f R\r\n", AT_NS, THREE),
         ("(1436509052.249713) can0 123#0D3A1F T", AT_NS, THREE),
         ("(1436509052.249713251)   can0 123#0D3A1F", AT_NS + 251, THREE),
+        ("(1436509052.2497132519) can0 123#0D3A1F", AT_NS + 251, THREE),
         ("(1436509052.2497) can0 123#0D3A1F", AT_NS - 13_000, THREE),
         ("(0000000052) can0 123#", 52 * 10**9, CanFrame(0x123, b"")),
         ("(1436509052.249713) can0 00000123#R", AT_NS, ASKED),
@@ -129,6 +130,7 @@ ERROR_FRAME = CanFrame(0x80, b"", ERROR)
         ("0.5 1  123             Rx   d 3 0D A 1F", None),
         ("0.5 1  FFFFFFFFx       Rx   d 1 00", None),
         ("0.5 1  923             Rx   d 1 00", None),
+        ("0.5 CANFD 1 Rx 123", None),
         ("nonsense", None),
     ],
 )  # fmt: skip

@@ -46,7 +46,7 @@ def test_the_unit_of_times_is_known_by_their_steps(tmp_path: Path, unit_s: float
 
 @pytest.mark.parametrize(
     ("time", "apart_s"),
-    [(lambda n: f"{60 * n}", "0.06"), (lambda n: f"{n // 6:02}:{n % 6}0:00", "600")],
+    [(lambda n: f"{60 * n + 60}", "0.06"), (lambda n: f"{n // 6:02}:{n % 6}0:00", "600")],
 )
 def test_grasps_with_times_minutes_apart_are_doubted(
     tmp_path: Path, time: Callable[[int], str], apart_s: str
