@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from graspd.daemon.judge.decision import HELD, HoldDown, Limits, decide
-from graspd.daemon.judge.reasons import Decision, Moment, Reason
+from graspd.daemon.judge.reasons import Decision, Moment, Reason, parts_to_act_on, to_act_on
 
 LIMIT_NS = 100
 THRESHOLD = 0.4
@@ -108,3 +108,35 @@ def test_by_default_only_more_than_100_ms_is_stale() -> None:
         (0.1, 100_000_001, (Decision.UNKNOWN, (Reason.STALE,))),
     ):
         assert decide(p_slip, (), HELD, age_ns, Limits()) == wanted
+
+
+@pytest.mark.parametrize(
+    ("reasons", "shown"),
+    [
+        ("low-confidence settling not-kept joints-late", "joints-late not-kept settling low-conf"),
+        ("moving parity no-contact", "parity"),
+    ],
+)
+def test_reasons_to_act_on_come_first(reasons: str, shown: str) -> None:
+    found = to_act_on(Reason(each) for each in reasons.split())
+    assert " ".join(found).startswith(shown)
+    assert len(found) == len(shown.split())
+
+
+FF = {f"ff_biotac_{number}": "saturated" for number in range(1, 25)}
+
+
+@pytest.mark.parametrize(
+    ("health", "shown"),
+    [
+        ({"hand": "settling", "ff_3": "parity"}, {"parity": ["ff_3"], "settling": ["hand"]}),
+        ({"link": "stale", "hand": "settling", "joints": "joints-late"}, {"stale": ["link"]}),
+        ({**FF, "ff": "moving", "mf": "moving"}, {"saturated": ["ff"], "moving": ["mf"]}),
+        ({**FF, "ff_biotac_2": "parity"}, {"parity": ["ff"], "saturated": ["ff"]}),
+    ],
+)  # fmt: skip
+def test_parts_are_named_once_by_what_to_act_on(
+    health: dict[str, str], shown: dict[str, list[str]]
+) -> None:
+    found = parts_to_act_on({part: Reason(reason) for part, reason in health.items()})
+    assert list(found.items()) == list(shown.items())

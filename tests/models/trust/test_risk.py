@@ -32,6 +32,7 @@ def test_slips_of_every_stable_lift_end_stable(alpha: float) -> None:
     for _ in range(1000):
         lift(rule, -1e9, lambda stable: stable)
         assert rule.slips <= alpha * rule.lifts + START + ROUNDING
+        assert rule.bound == pytest.approx(alpha * rule.lifts + START)
     assert rule.slips == rule.lifts <= 9
     assert rule.decide(-1e9) is Permission.RISK_EXCEEDED
     # Less than one slip is left, and what it costs.
