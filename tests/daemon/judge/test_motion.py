@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from graspd.daemon.judge.motion_limits import MotionLimits, Tails
-from graspd.daemon.judge.stillness import Motion
-from graspd.daemon.judge.windows import STEPS, Noise
+from graspd.daemon.judge.stillness import Motion, StepRing
+from graspd.daemon.judge.windows import LOST_MAX, STEPS, Noise
 
 FINGER = np.ones((1, 24), dtype=np.bool_)
 SIGMA_COUNTS, CORRELATION = 3.5, 0.32
@@ -180,3 +180,14 @@ def test_the_slope_limit_fits_19_of_20_real_touches(sweeps: int, counts_per_s: f
     limits = MotionLimits(1, Tails.of(1, 0.05, early=True))
     limits.lay([0.0], by_noise.tolist())
     assert limits.fast[0] * by_noise[0] == pytest.approx(counts_per_s, rel=0.1)
+
+
+def test_an_electrode_that_stays_unusable_is_lost_for_good() -> None:
+    ring, usable = StepRing((1, 24)), FINGER.copy()
+    ring.begin(0)
+    ring.find_lost(None)
+    usable[0, 3] = False
+    for sweep in range(1, 600):
+        gone = ring.find_lost(usable)
+        assert gone is not None
+        assert gone.sum() == gone[0, 3] == (sweep > LOST_MAX)
