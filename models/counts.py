@@ -1,5 +1,5 @@
-"""Counts of grasps as a program has them, tables, arrays or lists, as one array. A table's library
-is only used to get column names, and values by name."""
+"""Convert counts of grasps, given as a table, an array or lists, to one array. No table library is
+imported: a table only has to give its column names, and each column by name."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ def counts_of(given: ArrayLike, fingers: Sequence[Finger] = ()) -> NDArray[np.fl
 
     `given`: a table of pandas, polars or Arrow, or columns by name, such as `ff_biotac_1`; or an
     array or nested lists of that shape. A missing or masked value is a broken electrode.
-    `fingers`: those of the counts, in order; empty: those of the table, or any number of an array.
+    `fingers`: fingers to take from a table, or those of an array, in order; empty: all of a table,
+    or any of an array.
     Raises `ValueError` for anything else, and for values that are not counts.
     """
     names = column_names(given)
@@ -41,7 +42,7 @@ def counts_of(given: ArrayLike, fingers: Sequence[Finger] = ()) -> NDArray[np.fl
 
 
 def column_names(given: object) -> list[str]:
-    """Return the names of a table's columns; empty if it is not a table. Raises `ValueError`."""
+    """Return a table's column names; empty: not a table. Raises `ValueError` for a lazy table."""
     if isinstance(given, Mapping):
         return list(given)
     if not hasattr(given, "__array__"):
@@ -55,14 +56,14 @@ def column_names(given: object) -> list[str]:
 
 
 def fingers_of(names: Sequence[str]) -> tuple[Finger, ...]:
-    """Return the fingers that have columns of these names, in the order of the hand."""
+    """Return the fingers whose first electrode is a column here, in the order of the hand."""
     return tuple(finger for finger in FINGERS if electrode_columns(finger)[0] in names)
 
 
 def write_csv(table: Any, folder: str) -> Path:  # noqa: ANN401
-    """Write a table into a file, a missing value as an empty cell; return its path.
+    """Write `table.csv` in a folder, a missing value as an empty cell; return the file's path.
 
-    Raises `ValueError` for a column that occurs twice, is rounded, or is longer than others.
+    Raises `ValueError` for a column that occurs twice, is of float16, or differs in length.
     """
     names, path = column_names(table), Path(folder, "table.csv")
     columns = [_cells(column, what) for what, column in _columns(table, names, names).items()]
@@ -108,8 +109,9 @@ def _of_table(table: Any, names: Sequence[str], fingers: Sequence[str]) -> NDArr
 
 
 def _columns(table: Any, needed: Sequence[str], names: Sequence[str]) -> dict[str, Any]:  # noqa: ANN401
-    """Return the `needed` columns by name, with None for NA of pandas, which is not a number.
-    Raises `ValueError` for a column that occurs twice, or lacks one value for each row."""
+    """Return the `needed` columns, with None for pandas' NA. Keys are `the column NAME`.
+
+    `names`: all columns. Raises `ValueError` for one that occurs twice or differs in length."""
     found: dict[str, Any] = {}
     shape = None
     for name in needed:
@@ -129,7 +131,7 @@ def _columns(table: Any, needed: Sequence[str], names: Sequence[str]) -> dict[st
 
 
 def _numbers(given: Any, what: str) -> NDArray[np.float64]:  # noqa: ANN401
-    """Return numbers, with NaN for missing or masked ones. Raises `ValueError` for others."""
+    """Return values as numbers, NaN for missing or masked ones. Raises `ValueError` for text."""
     try:
         # numpy loses the masks of arrays within lists.
         nested = isinstance(given, list | tuple) and any(

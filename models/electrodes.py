@@ -1,4 +1,4 @@
-"""Compare a reading with the training: find and repair wrong electrodes, refuse new readings.
+"""Compare a reading with the training: repair wrong electrodes, refuse readings unlike it.
 
 All counts together are modelled as a Gaussian with the mean and covariance of the training. Let d
 be the deviations from the mean, and P the inverse covariance. The other electrodes then predict
@@ -117,9 +117,9 @@ class Electrodes:
     def examine(
         self, values: NDArray[np.float64], broken: NDArray[np.bool_], *, in_session: bool
     ) -> Examination:
-        """Examine counts, shape (fingers, 24), in which electrodes known as `broken` are repaired.
+        """Examine counts, shape (fingers, 24); the caller has repaired the `broken` electrodes.
 
-        `in_session`: True if they were mapped to the training's sensors by a session.
+        `in_session`: True if a session has mapped the counts to the training's sensors.
         """
         known = int(np.count_nonzero(broken))
         if known == values.size:
@@ -211,7 +211,7 @@ class Electrodes:
         return never
 
     def is_near(self, square: float, contradicted: int = 0) -> bool:
-        """Return True if a reading of this `square` fits the covariance.
+        """Return True if a reading with this mean square deviation fits the covariance.
 
         `contradicted`: number of its repaired electrodes that contradicted the others.
         """
@@ -219,7 +219,7 @@ class Electrodes:
         return self._square_min <= square <= share**2 * self._square_max
 
     def is_learned(self, square: float) -> bool:
-        """Return True if a session may learn from a mapped reading of this `square`."""
+        """Return True if a session may learn from a mapped reading with this mean square."""
         return square <= LEARNED_DISTANCES**2 * self._square_max
 
 

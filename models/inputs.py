@@ -56,7 +56,7 @@ class InputBuilder:
 
 
 def builder(kind: Input, fingers: int) -> InputBuilder:
-    """Return the builder for an input of a contract. Raises `ModelError` for an unknown one."""
+    """Return the builder for an input of a contract. Raises `ModelError` for an unknown image."""
     match kind:
         case ImageInput():
             from graspd.models import tactile_image  # only where it is needed

@@ -22,7 +22,7 @@ PUBLISHED = zoo.ZOO / "published-grasps.crc32"
 """Hashes of the grasps of all published tables, little-endian, in the order of `TABLES`."""
 
 Hashes = NDArray[np.uint32]
-"""Shape (N, fingers)."""
+"""CRC-32 of the counts of each finger of N grasps, shape (N, fingers)."""
 
 
 def hashes(counts: NDArray[np.uint16]) -> Hashes:
@@ -33,7 +33,7 @@ def hashes(counts: NDArray[np.uint16]) -> Hashes:
 
 
 def as_text(grasps: Hashes) -> str:
-    """Return hashes as a text for `METADATA_KEY`."""
+    """Return hashes as base64 text for `METADATA_KEY`."""
     return base64.b64encode(grasps.astype("<u4").tobytes()).decode()
 
 
@@ -44,9 +44,10 @@ def are_among(grasps: Hashes, others: Hashes) -> NDArray[np.bool_]:
 
 
 def of_model(model: TactileModel) -> Hashes:
-    """Return the hashes of a model's training grasps; no rows if the file has none.
+    """Return the hashes of a model's training grasps.
 
-    Raises `ModelError` if the file's hashes are broken.
+    A file without hashes gets those of its published tables; without these, no rows. Raises
+    `ModelError` if the file's hashes are broken.
     """
     fingers = model.contract.fingers
     text = model.metadata(METADATA_KEY)
@@ -60,7 +61,7 @@ def of_model(model: TactileModel) -> Hashes:
 
 
 def _of_published(digests: Sequence[str], fingers: Sequence[Finger]) -> Hashes:
-    """Return the hashes of the published tables among those with these digests."""
+    """Return the hashes of all grasps of the published tables with these digests (SHA-256)."""
     if not set(fingers) <= set(TABLE_FINGERS):
         return np.empty((0, len(fingers)), np.uint32)
     rows = np.fromfile(PUBLISHED, "<u4").reshape(-1, len(TABLE_FINGERS))

@@ -25,17 +25,17 @@ FULL_COUNTS = 1600.0
 Levels grow with the square root, so a touch of 20 counts has level 11.
 """
 FULL_DEVIATIONS = 2.5
-"""Deviation at level `FULL` while the rest is unknown, in standard deviations of the finger."""
+"""Deviation at level `FULL` without resting counts, in standard deviations of the finger."""
 SHARE = 0.02
-"""Weight of a new reading in the rest, which at 100 Hz follows within half a second."""
+"""Weight of a new reading in the resting counts, which at 100 Hz follow within half a second."""
 STRAY_COUNTS = 20.0
-"""Largest change that one reading makes to the rest, counts. It may already be a touch."""
+"""Limit of a deviation from rest in learning, counts; a larger one, perhaps a touch, is clipped."""
 KNOWN_AFTER = 25
-"""Number of readings whose mean is the first rest."""
+"""Number of readings after which their mean counts as the resting counts."""
 
 _FILL = fill_matrix(D1, Fill.NEIGHBOUR_MEAN)[:, :ELECTRODES]
 PIXELS = [row * WIDTH + column for row, column in zip(D1.rows, D1.columns, strict=True)]
-"""Pixel of each electrode E1..E24."""
+"""Pixel of each electrode E1..E24: its index in the image in row-major order."""
 
 
 class RestCounts:
@@ -50,7 +50,7 @@ class RestCounts:
         return self._means[finger] if self._readings[finger] >= KNOWN_AFTER else None
 
     def learn(self, finger: str, counts: NDArray[np.float64], sound: NDArray[np.bool_]) -> None:
-        """Learn from a reading of a finger without contact; shapes (24,)."""
+        """Learn the `sound` electrodes of a finger without contact; shapes (24,)."""
         mean = self._means.setdefault(finger, np.zeros(ELECTRODES))
         strays = counts - mean
         if self.of(finger) is not None:
@@ -63,9 +63,10 @@ class RestCounts:
 def fall_of(
     counts: NDArray[np.float64], sound: NDArray[np.bool_], rest: NDArray[np.float64] | None
 ) -> NDArray[np.float64]:
-    """Return how far each electrode of a finger is below `rest`, counts; all shapes (24,).
+    """Return how far each electrode of a finger is below its resting counts; all shapes (24,).
 
-    `rest` None: below the median of the `sound` electrodes. Others get the median fall.
+    `rest` None: below the median of the `sound` electrodes. Electrodes that are not sound get the
+    median fall of the sound ones; 0 without any.
     """
     reference = median(counts[sound]) if rest is None and sound.any() else rest
     fall = np.zeros(ELECTRODES) if reference is None else reference - counts

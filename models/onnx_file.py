@@ -45,7 +45,7 @@ constants of the model, so that each run takes as long as the first."""
 ELEMENTWISE = frozenset({"Mul", "Sub"})
 """Operators whose result is as wide as their widest input. Trees may read their results."""
 TEXTS = {"LEAF": 0, "BRANCH_LEQ": 1}
-"""Numbers for the texts of an attribute, which are kinds of a tree's nodes; 2: any other."""
+"""Numbers that stand for an attribute's texts, kinds of a tree's nodes; 2: any other text."""
 LEAF, BRANCH = TEXTS.values()
 VALUES = frozenset(range(2, 12))
 """Field numbers of an attribute's values, one for each type of value."""
@@ -143,7 +143,7 @@ class _Reader:
         return name, values
 
     def _read_tensor(self, tensor: memoryview | int) -> str:
-        """Check a tensor; return its name."""
+        """Return a tensor's name. Raises `ModelError` if its weights are in another file."""
         name = ""
         for field_number, value in self._fields(tensor):
             if field_number == 8:
@@ -170,7 +170,7 @@ class _Reader:
             self._fixed.update(node.outputs)
 
     def _at(self, message: memoryview | int, *path: int) -> list[Any]:
-        """Return the values of the fields that these field numbers lead to."""
+        """Return the values of the fields at `path`, field numbers from the message inwards."""
         found = [value for number, value in self._fields(message) if number == path[0]]
         if len(path) == 1:
             return found
@@ -239,7 +239,10 @@ def _reached(
     roots: list[int],
     width: range,
 ) -> set[int]:
-    """Return the places of the nodes below the roots. Raises `ModelError` if paths meet."""
+    """Return the indices of the nodes that are reached from the roots; empties `roots`.
+
+    `places`: index of a node by tree and number. `width`: indices of the inputs. Raises
+    `ModelError` if a node is reached twice, is missing, or compares no input."""
     trees, _, modes, features, *children = (lists[f"nodes_{name}"] for name in NODE_LISTS)
     reached = set[int]()
     while roots:

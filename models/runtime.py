@@ -101,7 +101,7 @@ def check_operators(path: Path, data: bytes) -> None:
 
 
 def single_threaded(model: bytes) -> ort.InferenceSession:
-    """Return a session as the daemon runs it. Raises onnxruntime's exceptions."""
+    """Return an onnxruntime session on one thread, as in the daemon. Raises its exceptions."""
     options = ort.SessionOptions()
     # One thread, no spinning: a second thread gains nothing on a small network, and spinning
     # between readings would burn a core of the robot's PC.

@@ -1,6 +1,6 @@
 """Load a model for a daemon, after a trial in a process of its own.
 
-A bad model may be slow, take too much memory or crash, and then only that process does. The trial
+A bad model may be slow, take too much memory or crash; this then harms only that process. The trial
 takes 0.2 s. Models of the zoo, known by the digest in their card, need none.
 """
 
@@ -28,7 +28,7 @@ A start of the daemon waits for it.
 MEMORY_MAX_BYTES = 640 << 20
 """Most memory of the trial's process, bytes; the service has a gigabyte."""
 VARIED = 20
-"""Number of readings in the trial with any counts, and number of those like the training's."""
+"""Number of random readings in a trial, and of others within the training's range."""
 REFUSED = 2
 PR_SET_PDEATHSIG = 1
 """Option of prctl(2): a signal for this process when its parent ends."""
