@@ -27,7 +27,7 @@ def implausible(
 
 
 def correlated(seed: int = 0) -> tuple[NDArray[np.float64], NDArray[np.float64], SeenCounts]:
-    """Mean (72,) and covariance (72, 72) of made-up electrodes, and the contract's words for it."""
+    """Return mean (72,) and covariance (72, 72) of made-up electrodes, and their `SeenCounts`."""
     random = np.random.default_rng(seed)
     mean = random.uniform(1500.0, 2500.0, 72)
     mixing = random.normal(size=(72, 10)) * 120.0
@@ -90,7 +90,7 @@ def test_an_electrode_is_implausible_from_eight_deviations_on(
 
 
 @pytest.mark.parametrize(("seed", "at_most"), [(0, 6), (1, 10), (2, 10)])
-def test_the_search_takes_out_the_worst_first(seed: int, at_most: int) -> None:
+def test_the_search_for_broken_electrodes_marks_the_worst_first(seed: int, at_most: int) -> None:
     mean, covariance, seen = correlated(seed)
     random = np.random.default_rng(seed)
     values = random.multivariate_normal(mean, covariance)
@@ -130,7 +130,7 @@ def test_stuck_electrodes_of_real_grasps_are_found(side: Grasps) -> None:
     assert np.mean(found) > 0.95
 
 
-def test_a_finger_that_moved_as_a_whole_is_noticed() -> None:
+def test_a_finger_whose_electrodes_all_shifted_is_noticed() -> None:
     mean, covariance, seen = correlated()
     random = np.random.default_rng(8)
     electrodes = Electrodes(seen)
@@ -157,7 +157,7 @@ def _moved_by(
     precision: NDArray[np.float64],
     chosen: NDArray[np.float64],
 ) -> float:
-    """In its standard deviations."""
+    """Return how far the `chosen` electrodes seem shifted by one offset, in standard deviations."""
     along = chosen @ precision
     return float(abs(along @ (values.ravel() - mean)) / np.sqrt(along @ chosen))
 
@@ -224,7 +224,7 @@ def test_a_contract_that_contradicts_itself_is_refused(
         ModelContract.from_json(msgspec.json.encode(content | change).decode())
 
 
-def test_a_reading_that_is_not_finite_teaches_nothing() -> None:
+def test_a_reading_with_nan_is_neither_near_nor_learned() -> None:
     check, values = Electrodes(round_numbers(spread=1 / 100)), np.full((3, 24), 2000.0)
     values[0, 0] = np.nan
     square = check.compare(values).mean_square()

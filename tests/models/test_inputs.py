@@ -1,4 +1,4 @@
-"""What models are fed with, against plain loops over the paper's definitions."""
+"""Inputs of models: one reading as in a batch, flat fingers, and the order of fingers."""
 
 from __future__ import annotations
 
@@ -72,7 +72,9 @@ def test_a_flat_finger_has_no_spread_and_no_infinities(wanted: Input) -> None:
 @pytest.mark.parametrize(
     ("composition", "axis"), [(Composition.HORIZONTAL, 1), (Composition.VERTICAL, 0)]
 )
-def test_fingers_stand_side_by_side_in_their_order(composition: Composition, axis: int) -> None:
+def test_a_composed_image_joins_the_fingers_images_in_order(
+    composition: Composition, axis: int
+) -> None:
     readings = counts(5)
     channels, _ = TactileImager(3, D1).build_batch(readings)
     composed, _ = TactileImager(3, D1, composition=composition).build_batch(readings)

@@ -1,4 +1,4 @@
-"""What an ONNX file computes with is read as `onnx` reads it, and nothing gets by."""
+"""ONNX files with forbidden or endless parts are refused; `onnx` is the other reader."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SEED = 7
 
 
 def small() -> Any:  # noqa: ANN401 - onnx has no types
-    """A model of some kinds of nodes, small enough that damage hits what matters."""
+    """Return a small model of several kinds of nodes, so that random damage often matters."""
     helper = onnx.helper
     nodes = [
         helper.make_node("Reshape", ["x", "shape"], ["y"]),
@@ -55,7 +55,7 @@ TREES: dict[str, list[Any]] = {
     "target_ids": [0, 0, 0, 0, 0],
     "target_weights": [1.0, 2.0, 3.0, 4.0, 5.0],
 }
-"""Two trees: 0 asks twice, 1 once."""
+"""Two trees: tree 0 has two branches, tree 1 has one."""
 
 
 def trees(**changed: list[Any]) -> Any:  # noqa: ANN401
@@ -78,7 +78,7 @@ def tensors(graph: Any) -> Iterator[Any]:  # noqa: ANN401
 
 
 def is_sound(model: Any) -> bool:  # noqa: ANN401
-    """What must hold of a model that is not refused, by another reader."""
+    """True if a model, as read by `onnx`, has no part for which it must be refused."""
     graph = model.graph
     inner = [
         attribute
@@ -122,7 +122,7 @@ def test_zoo_and_a_small_model_may_be_used() -> None:
         ("node { attribute { name: 'a' i: 1 } attribute { name: 'a' i: 2 } }", "a twice"),
     ],
 )
-def test_what_may_not_be_is_named(more: str, says: str) -> None:
+def test_the_refusal_of_a_forbidden_part_names_it(more: str, says: str) -> None:
     model = small()
     text_format.Merge(f"graph {{ {more} }}", model)
     with pytest.raises(ModelError, match=says):
@@ -149,15 +149,17 @@ def test_what_may_not_be_is_named(more: str, says: str) -> None:
         ({"target_ids": [0, 0, 0, 0, 1]}, "not one of a leaf"),
     ],
 )
-def test_trees_are_checked_as_trees(changed: dict[str, list[Any]], says: str) -> None:
+def test_trees_with_cycles_gaps_or_wrong_lists_are_refused(
+    changed: dict[str, list[Any]], says: str
+) -> None:
     model = small()
     model.graph.node[2].CopyFrom(trees(**changed))
     with pytest.raises(ModelError, match=says):
         onnx_file.check(model.SerializeToString())
 
 
-def test_trees_take_the_models_input_alone() -> None:
-    """Another value may be narrower than the features that they read."""
+def test_trees_that_read_a_reshaped_value_are_refused() -> None:
+    """A value that was reshaped may be narrower than the features that trees compare."""
     model = small()
     model.graph.node[2].input[0] = "y"
     with pytest.raises(ModelError, match="does not compare an input"):
@@ -175,7 +177,7 @@ def test_every_piece_of_a_split_graph_is_checked() -> None:
 
 
 def test_a_data_location_beyond_32_bits_is_refused() -> None:
-    """The readers of others keep the lowest 32 bits."""
+    """Other readers keep the lowest 32 bits, which are 1: data in another file."""
     location = bytes([14 << 3]) + b"\x81\x80\x80\x80\x10"  # 2**32 + 1
     tensor = b"\x42\x01w" + location
     graph = b"\x2a" + bytes([len(tensor)]) + tensor
@@ -183,14 +185,14 @@ def test_a_data_location_beyond_32_bits_is_refused() -> None:
         onnx_file.check(b"\x3a" + bytes([len(graph)]) + graph)
 
 
-def test_other_bytes_than_a_message_are_refused() -> None:
+def test_bytes_that_are_not_a_protobuf_message_are_refused() -> None:
     cut_off = (b"\x3a\x05\x0a", b"\x3a", b"\x38\xff", b"\x3d\x01")
     for content in (*cut_off, b"\x3b", b"\x00\x00", b"\xff" * 20, b"\x08" + b"\xff" * 9 + b"\x02"):
         with pytest.raises(ModelError, match="not a usable ONNX model"):
             onnx_file.check(content)
 
 
-def test_a_damaged_file_is_refused_without_another_error() -> None:
+def test_a_damaged_file_is_refused_or_still_a_sound_model() -> None:
     whole = small().SerializeToString()
     seeds = random.Random(SEED)
     passed = 0

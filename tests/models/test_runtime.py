@@ -1,4 +1,4 @@
-"""Loading a model: what does not fit is refused in one line, an unknown one is tried by itself."""
+"""Loading a model: a wrong file is refused in one line, one from outside the zoo is tried first."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from graspd.models.runtime import TactileModel
 CNN1 = zoo.find("cnn1")
 
 
-def test_the_answer_is_two_probabilities_that_follow_the_image() -> None:
+def test_two_probabilities_sum_to_one_and_depend_on_the_input() -> None:
     model = TactileModel(CNN1)
     random = np.random.default_rng(0)
     answers = []
@@ -81,7 +81,7 @@ def test_a_model_that_contradicts_its_contract_is_refused(
         TactileModel(tmp_path / "model.onnx")
 
 
-def test_another_input_or_no_contract_is_refused(tmp_path: Path) -> None:
+def test_a_model_with_another_input_or_no_contract_is_refused(tmp_path: Path) -> None:
     onnx = pytest.importorskip("onnx", reason="needs the extra `train`")
     model, path = onnx.load(CNN1), tmp_path / "model.onnx"
     renamed = onnx.compose.add_prefix(model, "another_")
@@ -102,7 +102,7 @@ def nothing_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def processes(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Paths of the models that were tried."""
+    """Return a list that gets the path of each model tried in a process of its own."""
     tried: list[str] = []
     run = subprocess.run
 
@@ -118,12 +118,14 @@ def copy(folder: Path, name: str = "mlp") -> Path:
     return Path(shutil.copy(zoo.find(name), folder / "mine.onnx"))
 
 
-def test_a_model_of_the_zoo_is_known(processes: list[str]) -> None:
+def test_a_model_of_the_zoo_is_loaded_without_trial(processes: list[str]) -> None:
     assert trial.load(zoo.find("mlp")).contract.name == "mlp"
     assert processes == []
 
 
-def test_a_model_that_is_not_is_tried_once(tmp_path: Path, processes: list[str]) -> None:
+def test_a_model_outside_the_zoo_is_tried_once_per_content(
+    tmp_path: Path, processes: list[str]
+) -> None:
     path = copy(tmp_path)
     for _ in range(2):
         assert trial.load(path).run() == TactileModel(zoo.find("mlp")).run()
@@ -152,7 +154,7 @@ def test_a_damaged_model_of_the_zoo_is_refused(
 
 
 @pytest.mark.parametrize("load", [trial.load, TactileModel])
-def test_a_damaged_model_is_refused_by_its_card(
+def test_a_damaged_model_is_refused_only_beside_its_card(
     load: Callable[[Path], TactileModel], tmp_path: Path
 ) -> None:
     path, card = copy(tmp_path), tmp_path / "mine.json"
@@ -166,12 +168,12 @@ def test_a_damaged_model_is_refused_by_its_card(
 
 
 def damaged(content: bytes) -> bytes:
-    """With one bit of a weight flipped."""
+    """Return the content of a model file with one bit of a weight flipped."""
     place = len(content) // 4
     return content[:place] + bytes([content[place] ^ 0x40]) + content[place + 1 :]
 
 
-def test_a_model_with_another_operator_is_refused(tmp_path: Path) -> None:
+def test_a_model_with_a_forbidden_operator_is_refused(tmp_path: Path) -> None:
     onnx = pytest.importorskip("onnx", reason="needs the extra `train`")
     model, path = onnx.load(zoo.find("mlp")), tmp_path / "loop.onnx"
     model.graph.node.add().op_type = "Loop"

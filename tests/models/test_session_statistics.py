@@ -42,7 +42,7 @@ def test_running_statistics_are_those_of_all_grasps_and_the_prior(
     np.testing.assert_allclose(session.spread, np.sqrt(variance), rtol=1e-12)
 
 
-def test_what_is_not_finite_changes_nothing() -> None:
+def test_a_grasp_that_is_not_finite_leaves_the_mean_unchanged() -> None:
     session = statistics()
     observe(session, grasps(3))
     mean = session.mean.copy()
@@ -53,7 +53,7 @@ def test_what_is_not_finite_changes_nothing() -> None:
     np.testing.assert_array_equal(session.mean, mean)
 
 
-def test_a_state_of_something_else_is_refused() -> None:
+def test_a_state_of_wrong_shape_values_or_weight_is_refused() -> None:
     session, ones = statistics(), (1.0,) * WIDTH
     observe(session, grasps(4))
     for state in (
@@ -72,7 +72,7 @@ def test_a_state_of_something_else_is_refused() -> None:
 @given(
     st.lists(st.lists(st.floats(-1e6, 1e6, width=32), min_size=WIDTH, max_size=WIDTH), max_size=40)
 )
-def test_no_sequence_of_grasps_takes_the_spread_away(rows: list[list[float]]) -> None:
+def test_the_prior_keeps_the_spread_above_zero_for_any_grasps(rows: list[list[float]]) -> None:
     session = statistics()
     for row in rows:
         session.observe(np.array(row))
@@ -90,7 +90,9 @@ def test_the_same_grasp_again_and_again_counts_once() -> None:
 
 
 def halves(slips: int) -> SessionStatistics:
-    """A session of a hundred grasps, half of them slips, then of slips, which read 600."""
+    """Return a session after 100 grasps, every other one a slip, then `slips` slips.
+
+    Values are near 600 in a slip and 400 in others."""
     session, random = statistics(), np.random.default_rng(3)
     for number in range(100 + slips):
         slip = number >= 100 or number % 2 == 0
@@ -98,13 +100,13 @@ def halves(slips: int) -> SessionStatistics:
     return session
 
 
-def test_slips_alone_hardly_move_a_session() -> None:
+def test_many_slips_in_a_row_hardly_move_the_mean() -> None:
     np.testing.assert_allclose(halves(0).mean, 500.0, atol=10.0)
     assert (halves(900).mean < 530.0).all()
 
 
-def test_a_session_that_began_wrongly_finds_back() -> None:
-    """All are called slips, though none is: what they read becomes the mean all the same."""
+def test_a_wrong_start_fades_even_if_all_count_as_slips() -> None:
+    """The first 20 grasps read 900. All later ones read 500 and are called slips."""
     session, random = statistics(), np.random.default_rng(4)
     observe(session, grasps(20, mean=900.0))
     for _ in range(5000):
@@ -112,7 +114,7 @@ def test_a_session_that_began_wrongly_finds_back() -> None:
     np.testing.assert_allclose(session.mean, 500.0, atol=60.0)
 
 
-def test_an_unbalanced_session_continues_where_it_was() -> None:
+def test_a_session_of_mostly_slips_is_restored_exactly() -> None:
     session = halves(300)
     other = statistics()
     other.restore(msgspec.json.decode(msgspec.json.encode(session.state()), type=SessionState))
@@ -139,13 +141,13 @@ SPREAD = np.full((3, 24), 100.0)
         (MEAN, SPREAD * 4.0, True, True),
     ],
 )
-def test_what_cannot_have_been_grasps_is_odd(
+def test_sessions_with_impossible_mean_or_spread_are_odd(
     mean: NDArray[np.float64], spread: NDArray[np.float64], enough: bool, odd: bool
 ) -> None:
     assert is_odd(mean, spread, MEAN, SPREAD, enough=enough) is odd
 
 
-def test_fingers_that_read_alike_are_in_any_order() -> None:
+def test_fingers_with_the_same_means_never_count_as_swapped() -> None:
     alike = np.full((3, 24), 2000.0)
     random = np.random.default_rng(5)
     for _ in range(50):

@@ -31,7 +31,7 @@ D1_PIXELS = list(
 
 
 def plain_filled(counts: Sequence[int | None], least_contact: bool) -> Image:
-    """Return an image; None is a broken electrode."""
+    """Return the filled D1 image of one finger; a count of None is a broken electrode."""
     image: list[list[float | None]] = [[None] * 11 for _ in range(12)]
     for (row, column), count in zip(D1_PIXELS, counts, strict=True):
         image[row][column] = None if count is None else float(count)
@@ -69,7 +69,7 @@ def plain_image(counts: list[int], least_contact: bool, over_electrodes: bool) -
 
 @pytest.mark.parametrize("fill", Fill)
 @pytest.mark.parametrize("normalisation", Normalisation)
-def test_real_grasps_equal_the_plain_implementation(
+def test_images_of_real_grasps_equal_the_plain_implementation(
     bts3_dir: Path, fill: Fill, normalisation: Normalisation
 ) -> None:
     counts = read_table(bts3_dir / "palm_side.csv").counts[::10]
@@ -115,7 +115,7 @@ def test_any_counts_give_a_finite_image_or_zeros(counts: np.ndarray) -> None:
             assert not image[..., finger].any()
 
 
-def test_not_a_number_has_no_image() -> None:
+def test_a_finger_with_nan_gets_an_image_of_zeros() -> None:
     counts = np.tile(np.arange(24.0) * 100, (3, 1))
     counts[1, 5] = np.nan
     image = np.ones((12, 11, 3), dtype=np.float32)
@@ -127,7 +127,7 @@ def test_not_a_number_has_no_image() -> None:
 
 
 @pytest.mark.parametrize("fill", ["neighbour-mean", "least-contact"])
-def test_images_of_a_user_are_the_filled_ones(fill: str) -> None:
+def test_tactile_images_of_raw_counts_equal_the_plain_filling(fill: str) -> None:
     drawn = np.random.default_rng(7).integers(1, 4096, (2, 3, 24)).tolist()
     drawn[0][1][:4] = [None] * 4  # broken, in a corner
     drawn[1][2][23] = None
@@ -138,7 +138,7 @@ def test_images_of_a_user_are_the_filled_ones(fill: str) -> None:
         np.testing.assert_allclose(image, np.moveaxis(np.array(plain), 0, 2), rtol=1e-12)
 
 
-def test_a_finger_without_counts_has_no_image_of_any_layout() -> None:
+def test_the_image_of_a_finger_without_counts_is_nan() -> None:
     counts = np.full((1, 2, 24), 2000.0)
     counts[0, 1] = np.nan
     images = graspd.tactile_images(counts, "D3")
@@ -147,7 +147,7 @@ def test_a_finger_without_counts_has_no_image_of_any_layout() -> None:
     assert np.isnan(images[..., 1]).all()
 
 
-def test_another_layout_or_fill_is_refused_by_name() -> None:
+def test_an_unknown_layout_or_fill_is_refused_by_name() -> None:
     counts = np.zeros((1, 3, 24))
     with pytest.raises(ValueError, match="'D4': they are D1, D2a, D2b, D3"):
         graspd.tactile_images(counts, "D4")
