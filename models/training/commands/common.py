@@ -76,7 +76,7 @@ def add_shared_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 class _Data(argparse.Action):
-    """Keep a folder as `data`, and add a file to `own`."""
+    """Action of `--data`: set `data` to a folder, or append a file to `own`."""
 
     def __call__(
         self,
@@ -96,7 +96,7 @@ def exit_code(
 ) -> int:
     """Run `work`, which writes into `folder`; print an error in one line.
 
-    Returns 0; 1 for `failures`; 2 for wrong input, data or folder; 130 for Ctrl-C.
+    Returns 0; 1 for an exception of `failures`; 2 for wrong input, data or folder; 130 for Ctrl-C.
     """
     try:
         work()
@@ -169,7 +169,8 @@ def progress_bar(
 ) -> Iterator[Callable[[str], None]]:
     """Show on stderr, if it is a terminal, how many of `total` trainings are done.
 
-    Yields a function to call after each training, with the bar's next text.
+    `first`: text of the bar at first. Yields a function to call after each training, with the
+    bar's next text.
     """
     from rich.console import Console
     from rich.progress import MofNCompleteColumn, Progress

@@ -53,14 +53,14 @@ from graspd.models.training.systems.registry import (
 )
 
 SEEDS = 3
-"""Split seeds of an evaluation unless `--seeds` says otherwise."""
+"""Number of split seeds of an evaluation unless `--seeds` says otherwise."""
 QUICK_GRASPS, QUICK_FOLDS, QUICK_EPOCHS = 200, 2, 1
 """Grasps, folds and epochs of `--quick`, which only tests that all runs; figures mean nothing."""
 
 
 CONNECT_TIMEOUT_S = 10
 VERDICTS = "verdicts"
-"""Folder in --out of the rows of each system and protocol, as Parquet."""
+"""Folder in `--out` with a Parquet file of verdicts for each system and protocol."""
 
 
 def evaluate(args: argparse.Namespace) -> None:
@@ -95,7 +95,7 @@ def evaluate(args: argparse.Namespace) -> None:
 
 @contextmanager
 def _cluster(address: str) -> Iterator[None]:
-    """Run trainings on the cluster of the Dask scheduler at this address."""
+    """Run trainings on the cluster of the Dask scheduler at this address, within the block."""
     try:
         from distributed import Client, KilledWorker
     except ModuleNotFoundError as error:
@@ -121,7 +121,7 @@ def _systems(names: Sequence[str]) -> list[System]:
 
 
 def _protocols(args: argparse.Namespace, grasps: Grasps) -> list[EvalProtocol]:
-    """Return the requested protocols; without a request, all for which the tables exist."""
+    """Return the requested protocols; by default all, or of own tables alone `cv` and `objects`."""
     if args.protocol or args.data is not None:
         return list(dict.fromkeys(args.protocol or PROTOCOLS))
     if len(set(grasps.objects)) > 1:
@@ -182,7 +182,7 @@ def _evaluated(
 
 
 def _announce(wanted: Sequence[Job], at_once: int) -> None:
-    """Print what will run, and about how long each protocol and each system takes."""
+    """Print how many trainings run, and about how long each protocol and system takes if quick."""
     jobs = [(job.protocol, job.system.name, quick_seconds(job.system)) for job in wanted]
     took = pd.DataFrame(jobs, columns=["protocol", "system", "seconds"])
     total = f"about {took['seconds'].sum():.0f} s of processor time"
@@ -207,7 +207,7 @@ def _show(one: Figures, args: argparse.Namespace) -> None:
 
 
 def _report(grasps: Grasps, args: argparse.Namespace) -> None:
-    """Write the table of all results in the folder that belong to these grasps."""
+    """Write the results page to `--table`, from all results in `--out` that are of these grasps."""
     digests = {
         name: digest(with_recipes(system, epochs=QUICK_EPOCHS) if args.quick else system)
         for name, system in SYSTEMS.items()

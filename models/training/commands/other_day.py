@@ -130,7 +130,7 @@ def _figures(model: _Model, day: Grasps) -> dict[str, Any]:
 
 
 def _judged(judge: GraspJudge, day: Grasps) -> pd.DataFrame:
-    """Return a table with a row for the verdict on each grasp."""
+    """Judge grasps in order, each learned by the session; return a table with a row for each."""
     margins, refused = np.zeros(len(day)), np.zeros(len(day), np.bool_)
     for index, counts in enumerate(day.counts):
         examined = judge.examine(counts)
@@ -143,7 +143,7 @@ def _judged(judge: GraspJudge, day: Grasps) -> pd.DataFrame:
 
 
 def _line(figures: dict[str, Any]) -> str:
-    """Return the figures of a table for people."""
+    """Return the figures of one model on one table as a line of text."""
     parts = [f"{figures['grasps']} of {figures['all']} judged"]
     if figures["f1_interval"] is not None:
         low, high = figures["f1_interval"]

@@ -90,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _measured(source: Path, grasps: Grasps) -> tuple[MeasuredError, onnx.ModelProto]:
     """Return measured error and model. A Python file is trained on folds of objects, then on all
-    grasps."""
+    grasps; an ONNX file is measured on the whole table."""
     if source.suffix != ".py":
         try:
             network = source.read_bytes()

@@ -1,4 +1,4 @@
-"""Read grasp tables (BTS3) into arrays: a row per grasp, with counts before the lift, outcome."""
+"""Read grasp tables (BTS3): a row per grasp, with counts before the lift, object and outcome."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MAX_TABLE_BYTES = 64 * 2**20
 FEWEST_GRASPS = 20
 """Fewest grasps of a lab table; from this number a session counts as calibrated."""
 ENOUGH_GRASPS = 200
-"""Fewest grasps of lab tables without the published ones.
+"""Number of grasps below which a training on lab tables alone is warned of.
 
 Trained on 20 grasps of palm_45, the daemon refuses 98 % of the others as unlike the training; on
 100 grasps 20 %, on 200 6 %, on 500 2.5 %.
@@ -239,7 +239,9 @@ def _read_lab_table(path: Path, read_as: ReadAs | None) -> Grasps:
 
 
 def first_readings(counts: NDArray[np.uint16]) -> Ints:
-    """Return for each row the first row that it nearly repeats, maybe by others, shape (N,)."""
+    """Return the index of the first row of each row's group, shape (N,).
+
+    Rows that nearly repeat each other, directly or by way of other rows, form a group."""
     from sklearn.cluster import DBSCAN
 
     if not len(counts):

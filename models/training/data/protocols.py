@@ -46,7 +46,7 @@ DAYS_FOLDS = 4
 
 
 class TooFewGraspsError(ValueError):
-    """The data are too few for the folds: use fewer folds or more data."""
+    """The data lack a table, or are too few for the folds: use fewer folds or more data."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,11 +57,11 @@ class Split:
     train: Ints
     test: Ints
     calibration: Ints | None = None
-    """Grasps of other objects that may calibrate the session in `session`, without labels."""
+    """Rows of the judged session, of other objects, to calibrate it; None except in `session`."""
 
 
 def splits(protocol: EvalProtocol, grasps: Grasps, seed: int, folds: int = FOLDS) -> list[Split]:
-    """Return the splits of a protocol; `unknown` always has one.
+    """Return a split for each fold of a protocol; `unknown` has one, `days` some for each day.
 
     Raises `TooFewGraspsError` if the data lack a table, objects or grasps.
     """
@@ -160,7 +160,7 @@ def _unknown(grasps: Grasps, _seed: int, _folds: int) -> list[Split]:
 
 
 def _session(grasps: Grasps, seed: int, folds: int) -> list[Split]:
-    """Return splits that leave groups of objects out of both days, and test on the later day."""
+    """Return a split for each fold of objects: test on `palm_45`, training on others in `WHOLE`."""
     whole, later = _rows(grasps, *WHOLE), _rows(grasps, NEW_SESSION)
     fold_of = _object_folds(grasps, np.concatenate((whole, later)), folds, seed)
     of_whole, of_later = fold_of[: len(whole)], fold_of[len(whole) :]
@@ -175,7 +175,7 @@ def _session(grasps: Grasps, seed: int, folds: int) -> list[Split]:
 
 
 def _days(grasps: Grasps, seed: int, folds: int) -> list[Split]:
-    """Return a split for each fold of objects and each of `DAYS`; all days leave out the fold."""
+    """Return a split for each of `DAYS` and fold of objects, which the training leaves out."""
     folds = min(folds, DAYS_FOLDS)
     every = _rows(grasps, *WHOLE, NEW_SESSION)
     fold_of = np.full(len(grasps), -1)
@@ -202,7 +202,9 @@ _MAKERS: dict[EvalProtocol, Callable[[Grasps, int, int], list[Split]]] = {
 
 
 def _rows(grasps: Grasps, *tables: str, with_lab: bool = False) -> Ints:
-    """Return the indices of the grasps of these tables, which must exist, and lab tables."""
+    """Return the rows of these tables. Raises `TooFewGraspsError` if one is missing.
+
+    `with_lab`: add lab tables; if there are no others, return their rows alone."""
     names = [file.name for file in grasps.files]
     if with_lab:
         lab = lab_table_names(grasps.files)

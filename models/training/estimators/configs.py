@@ -61,7 +61,7 @@ ClassicalConfig = SvmConfig | ForestConfig | MlpConfig | BoostingConfig
 
 @dataclass(frozen=True, slots=True)
 class SecondConvolution:
-    """A convolution after the first one and its pooling (valid)."""
+    """A convolution without padding, after the first one and its pooling."""
 
     filters: int = 64
     kernel: int = 1
@@ -86,7 +86,7 @@ class NetworkConfig:
     dropout: float = 0.0
     """Fraction of values left out in training, before and after the hidden layer."""
     batch_norm: bool = True
-    """True: batch norm after each convolution and the hidden layer; convolutions lose bias."""
+    """True: batch norm after each convolution, without bias then, and after the hidden layer."""
 
 
 CNN0 = NetworkConfig(filters=32, hidden=128)
@@ -148,7 +148,7 @@ class Recipe:
 
 @dataclass(frozen=True, slots=True)
 class SessionRecipe(Recipe):
-    """Recipe for session features: each batch is shifted by a `DayShift`."""
+    """Recipe for session features: each grasp of a batch is shifted at random by `day_shift`."""
 
     epochs: int = 40
     weight_decay: float = 1.0

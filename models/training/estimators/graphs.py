@@ -65,7 +65,7 @@ def weighted_sum(parts: Sequence[onnx.ModelProto], factors: Sequence[float]) -> 
 
 
 def with_probability(margin: onnx.ModelProto, temperature: float) -> onnx.ModelProto:
-    """Return the graph with `probability` (N, 2) of stable and slip: sigmoid(margin / T)."""
+    """Return a margin's graph with output `probability` (N, 2): 1 - p, p = sigmoid(margin / T)."""
     # softmax(-m / 2T, m / 2T) is 1 - sigmoid(m / T), sigmoid(m / T).
     share = np.array([[-0.5, 0.5]]) / temperature
     nodes = nodes_of(

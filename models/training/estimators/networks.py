@@ -105,7 +105,7 @@ def build(config: NetworkConfig, shape: Sequence[int] = IMAGE_SHAPE) -> nn.Seque
 
 @contextmanager
 def reproducible(seed: int, threads: int = THREADS) -> Iterator[None]:
-    """Seed torch, fix its threads, and allow only deterministic algorithms, until the end."""
+    """Seed torch, fix its threads, and allow only deterministic algorithms within the block."""
     threads_before = torch.get_num_threads()
     deterministic_before = torch.are_deterministic_algorithms_enabled()
     with torch.random.fork_rng(devices=[]):

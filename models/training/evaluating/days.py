@@ -44,8 +44,8 @@ def verdicts(
 def judged_days(trained: Trained, grasps: Grasps, test: Ints, seed: int) -> Iterator[pd.DataFrame]:
     """Judge the rows `test` of grasps with a trained system; each table is a new session.
 
-    A session system judges each table in random order, then object by object. Refused grasps also
-    have margins.
+    Yields one frame of verdicts, or two for a session system, which judges all rows in random
+    order, then again object by object. Refused grasps also have margins.
     """
     counts, table_of = grasps.counts[test], grasps.table_of[test]
     if not isinstance(trained.system.input, SessionFeatures):

@@ -46,7 +46,7 @@ class Figures:
 
     @classmethod
     def of(cls, rows: pd.DataFrame) -> Figures:
-        """Group the rows of all folds of all seeds, which are in their order."""
+        """Score the rows of all folds of all seeds, for each variant, seed and fold."""
         scores = {
             key: metrics.score(*(part[name].to_numpy() for name in SCORED))
             for key, part in rows.groupby(["variant", "seed", "fold"], sort=False)
@@ -74,7 +74,7 @@ class Figures:
     def headline(self) -> str:
         """Variant whose figures are quoted for the system.
 
-        In the protocol `session` it is the one with 50 unlabelled grasps.
+        It is `n50`, calibrated by 50 unlabelled grasps, if the rows have it; else the first.
         """
         return Variant.N50 if Variant.N50 in self.variants else self.variants[0]
 
@@ -90,7 +90,7 @@ class Figures:
 
     @property
     def folds(self) -> int:
-        """Number of trainings of a seed."""
+        """Number of folds, which is the number of trainings of a seed."""
         return int(self.rows["fold"].nunique())
 
     @property

@@ -71,9 +71,9 @@ def judged(job: Job, grasps: Grasps) -> pd.DataFrame:
     """Train on a split, on one thread, and return a row for each verdict on a grasp left out.
 
     Columns: `variant`; `grasp`, its index in `grasps`; `margin`, the uncalibrated log-odds of slip;
-    `refused`, true if the daemon would call it `unknown` (only `days` tells); `age`, the grasps
-    that its running session had before. The training has `fold_name`, `train_grasps`, `parameters`
-    (numbers that the trained system consists of) and `seconds` (with judging).
+    `refused`, true if the daemon would call it `unknown` (missing except in `days`); `age`, the
+    grasps that its running session had before. The training has `fold_name`, `train_grasps`,
+    `parameters` (numbers that the trained system consists of) and `seconds` (with judging).
 
     The result depends on the arguments alone. Raises `TooFewGraspsError` if the data
     lack that split, `ValueError` if the system cannot learn from it.

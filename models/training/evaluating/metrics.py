@@ -120,7 +120,7 @@ def cross_fitted(rows: pd.DataFrame) -> pd.Series:
 
 
 def over_seeds(figures: Floats) -> Spread:
-    """Return mean and spread of figures (seeds, folds) without NaN; only NaN gives NaN."""
+    """Return mean and spread of figures (seeds, folds), ignoring NaN; NaN if all are NaN."""
     seeds, folds = figures.shape
     if np.isnan(figures).all():  # the mean of no values would warn
         return Spread(math.nan, math.nan, None, seeds, folds)
@@ -159,14 +159,14 @@ def interval(some: pd.Series, of: pd.Series, objects: pd.Series) -> tuple[float,
 
 
 def confusion(rows: pd.DataFrame) -> Ints:
-    """Return numbers of grasps, shape (2, 2): actual stable, slip by judged stable, slip."""
+    """Return numbers of grasps, shape (2, 2): rows held, slipped; columns judged stable, slip."""
     counts: Ints = np.zeros((2, 2), np.int64)
     np.add.at(counts, (rows["slipped"].astype(int), (rows["margin"] > 0.0).astype(int)), 1)
     return counts
 
 
 def verdict_figures(rows: pd.DataFrame) -> dict[str, float | None]:
-    """Return the scores of verdicts, as fractions, slip positive; None: no such grasp."""
+    """Return number of grasps and scores of verdicts, slip positive; None: a share of no grasp."""
     (held, alarms), (missed, found) = confusion(rows).tolist()
     return {
         "grasps": len(rows),
@@ -182,7 +182,7 @@ def _share(some: int, of: int) -> float | None:
 
 
 def by_confidence(probability: pd.Series, slipped: pd.Series) -> pd.DataFrame:
-    """Return `accuracy` and `coverage` of the verdicts with at least each `confidence`, falling.
+    """Return a table: `accuracy` and `coverage` of verdicts from each `confidence` on, falling.
 
     Verdicts of equal confidence count together.
     """

@@ -86,7 +86,7 @@ def _findings(by_group: ByGroup) -> Iterator[str]:
 
 
 def _figures(by_group: ByGroup) -> dict[str, str]:
-    """Return all figures by their key in a finding."""
+    """Return the texts of all figures by their key in a finding, such as `svm/cv/difference`."""
     figures = {}
     for (system, protocol), one in by_group.items():
         key = f"{system}/{protocol}"

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 INK, PAPER, GRID, QUIET = "#1f2328", "#ffffff", "#d8dee4", "#6e7781"
 """Colours of text and axes, background, grid lines, and secondary text."""
 BLUE, NAVY, ORANGE, OLIVE = "#1f6f8b", "#123f50", "#c65d21", "#9a8f2f"
-"""Colours of graspd, graspd under a risk, others, and graspd without outcomes."""
+"""Colours of graspd, graspd under a risk limit, others, and graspd without outcomes."""
 DARK: Final = {
     INK: "#e6edf3",
     PAPER: "#0d1117",
@@ -34,7 +34,7 @@ _STYLE: Final = re.compile(r'style="([^"]*)"')
 
 @contextmanager
 def style() -> Iterator[None]:
-    """Draw in this style; a figure takes its colours when it is made."""
+    """Set this style for figures that are made within the block."""
     settings: dict[Any, Any] = {
         "svg.hashsalt": "graspd",
         "figure.facecolor": PAPER,

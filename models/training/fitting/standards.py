@@ -29,7 +29,7 @@ class Variant(StrEnum):
     ALL = "all"
     """All grasps of the judged session that are of other objects."""
     RUNNING = "running"
-    """The grasps judged before it in a session that starts empty; objects are mixed."""
+    """The grasps of the session judged before, from an empty start; objects are mixed."""
     RUNNING_SORTED = "running-sorted"
     """As `RUNNING`, but one object after the other."""
     TRAINING = "training"
@@ -99,7 +99,7 @@ def later_session(
     """Return standards for the rows `test` of features (all grasps, M), by variant.
 
     The second result has, for running variants, the number of grasps before each test grasp (N,).
-    `pool`: rows from which the other variants draw.
+    `pool`: rows of the session from which the other variants draw. `NONE` uses training alone.
     """
     random = np.random.default_rng(seed)
     standards = {Variant.NONE: training.prior, Variant.ALL: Standards.of(features[pool])}

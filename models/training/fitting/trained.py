@@ -49,8 +49,8 @@ class Trained:
     standards: TrainingStandards | None
     """Standards of a session system's features; None for other systems."""
     sensors: TrainingStandards | None
-    """Standards of counts (fingers * 24,) of a session system, to map tables to its `prior`; else
-    None."""
+    """Standards of a session system's counts (fingers * 24,), by which `mapped` maps tables; None
+    for other systems."""
 
     def margins(self, counts: Numbers, table_of: Ints) -> Floats:
         """Return uncalibrated log-odds of slip (N,) of counts (N, fingers, 24) and tables (N,)."""

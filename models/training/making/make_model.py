@@ -146,7 +146,7 @@ def _contract(plan: TrainingPlan, trained: Trained, measured: list[Figures]) -> 
 
 
 def _confidence(one: Figures) -> tuple[ConfidenceStep, ...]:
-    """Return the steps of the curve with at least `FEWEST_JUDGED` grasps."""
+    """Return the steps of the accuracy-coverage curve with at least `FEWEST_JUDGED` grasps."""
     rows = one.of_variant()
     return tuple(
         step
@@ -161,7 +161,7 @@ def _measured(one: Figures) -> MeasuredError:
 
 
 def _sharpness(measured: list[Figures]) -> tuple[Sharpness, ...]:
-    """Return the temperatures of a young session, none below that of a calibrated one."""
+    """Return a session's temperatures by age, over the model's own: 1 or more, never rising."""
     base = temperature(_calibrator(measured).of_variant())
     later = next((one for one in measured if one.protocol == "days"), None)
     if later is None or Variant.RUNNING not in later.variants:
@@ -190,8 +190,8 @@ def _never_seen(trained: Trained, contract: ModelContract, seed: int) -> dict[st
 
 
 def _data_sources(files: Sequence[Dataset]) -> dict[str, object]:
-    """Return licence and sources of the tables used for training or judging. The rest does not
-    apply to files under `not_published`, which differ from the published ones."""
+    """Return licence and sources of the tables used for training or judging. They do not apply to
+    the files under `not_published`, which differ from the published ones."""
     not_published = unpublished(files)
     sources: dict[str, object]
     if len(lab_table_names(files)) == len(files):

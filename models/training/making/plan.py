@@ -99,7 +99,7 @@ class TrainingPlan:
 def preflight(plan: TrainingPlan, grasps: Grasps) -> None:
     """Raise `TooFewGraspsError` if a training of the plan lacks grasps of a label.
 
-    A session model also needs `FEWEST_STANDARD` grasps of each table that tests it.
+    A session model also needs `FEWEST_STANDARD` training grasps of each table that tests it.
     """
     session = isinstance(plan.system.input, SessionFeatures)
     for where, of, train, test in _trainings(plan, grasps):
@@ -167,8 +167,8 @@ def limits(plan: TrainingPlan, grasps: Grasps) -> Iterator[str]:
 
 
 def _trainings(plan: TrainingPlan, grasps: Grasps) -> Iterator[tuple[str, Grasps, Ints, Ints]]:
-    """Yield each training's name and grasps, and the rows for training and judging. The training
-    rows are empty for a session that is calibrated while it is judged."""
+    """Yield each training's name and grasps, and its rows for training and judging. The rows for
+    judging are empty where the judged session needs no training grasps of its table."""
     for protocol in plan.protocols(grasps):
         for split in splits(protocol, grasps, plan.seed, plan.folds):
             alone = protocol == "days" or split.calibration is not None

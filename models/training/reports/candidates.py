@@ -79,7 +79,9 @@ def _model(model: TactileModel, grasps: Grasps) -> Candidate:
 
 
 def errors(figures: dict[str, Any]) -> dict[str, float]:
-    """Return the figures of a protocol, 0..1; the 95 % interval of F1 is Nadeau and Bengio's."""
+    """Return scores, 0..1, from a protocol's figures in a card.
+
+    `low` to `high` is the 95 % interval of `f1` (Nadeau and Bengio)."""
     spreads, folds = figures["spreads"], figures["folds"]
     f1 = spreads["f1"]
     share = figures["test_grasps"] / figures["train_grasps"]
@@ -146,7 +148,7 @@ def _published(counts: NDArray[np.uint16]) -> Step:
 
 
 def measure(steps: Mapping[str, Step], readings: int, paced: int) -> dict[str, Times]:
-    """Time each step on `readings` readings hot and `paced` readings at 100 Hz."""
+    """Time each step on `readings` readings without pause (hot), and on `paced` at 100 Hz."""
     for step in steps.values():
         for index in range(WARM_UP):
             step(index)
@@ -160,7 +162,7 @@ def measure(steps: Mapping[str, Step], readings: int, paced: int) -> dict[str, T
 
 
 def _hot(steps: Mapping[str, Step], readings: int) -> dict[str, list[int]]:
-    """Return the wall time of each reading, ns, one right after the other."""
+    """Return wall times by step, ns: `ROUNDS` times `readings` readings without pause."""
     times: dict[str, list[int]] = {name: [] for name in steps}
     for _ in range(ROUNDS):
         for name, step in steps.items():
@@ -174,7 +176,7 @@ def _hot(steps: Mapping[str, Step], readings: int) -> dict[str, list[int]]:
 def _paced(
     steps: Mapping[str, Step], readings: int
 ) -> tuple[dict[str, list[int]], dict[str, list[int]]]:
-    """Return wall and processor time of each reading, ns, 10 ms apart."""
+    """Return wall and processor times by step, ns, of readings 10 ms apart."""
     wall: dict[str, list[int]] = {name: [] for name in steps}
     cpu: dict[str, list[int]] = {name: [] for name in steps}
     due_s = time.perf_counter()

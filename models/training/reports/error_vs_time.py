@@ -62,7 +62,7 @@ PANELS = (
     (("session",), "another day"),
 )
 """Groups of protocols, and the title of each; a model has at most one protocol of a group. A model
-without the first one of a group was measured on two palm poses only, and is hollow."""
+without the first one of a group was measured on two palm poses only, and is drawn hollow."""
 TIME = "paced_p50_us"
 COLOURS = {"model": BLUE, "peer": ORANGE}
 MARKERS = {"model": "o", "peer": "s"}
@@ -81,7 +81,7 @@ Report = dict[str, Any]
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure models' error and time, write and print. Raises `DatasetError` or `ModelError`."""
+    """Measure run times; write and print the report. Raises `DatasetError` or `ModelError`."""
     grasps = read_all(args.data)
     page = None if args.page is None else args.page.read_text()
     if page is not None and len(PAGE_TABLE.findall(page)) != 1:
@@ -104,7 +104,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def report(grasps: Grasps, *, quick: bool) -> Report:
-    """Return the figures of all models of the zoo. Raises `ModelError`."""
+    """Return the figures of all candidates, timed now. Raises `ModelError`."""
     if quick:
         grasps = grasps.few()
     several = candidates(grasps)
@@ -140,8 +140,8 @@ def table(measured: Report) -> list[str]:
 
 
 def page_table(measured: Report) -> list[str]:
-    """Return the same for a page: models of the whole hand, the fastest first, without hot times
-    and intervals."""
+    """Return the table for a page: candidates for the whole hand, the fastest first, without hot
+    times and intervals."""
     rows = []
     for row in whole_hand(measured["rows"]):
         cells = _cells(row)

@@ -57,7 +57,7 @@ def fitted_scales(unscaled: pd.DataFrame) -> dict[tuple[int, int], float]:
 
 
 def after_outcomes(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the judged grasps whose verdict rests on an outcome."""
+    """Return the rows of judged grasps whose verdict rests on at least one outcome."""
     return rows[~rows["refused"] & (rows["outcomes"] > 0)]
 
 

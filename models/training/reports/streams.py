@@ -104,7 +104,7 @@ def judged(trained: Trained, grasps: Grasps, rows: Ints) -> tuple[Floats, Floats
 
 
 def live(stream: Stream, limits: RiskLimits, *, every: bool, scale: float = SCALE) -> pd.DataFrame:
-    """Judge, lift and report one grasp after the other; refused grasps are not lifted.
+    """Simulate a session: judge, lift and report each grasp in turn; refused ones are not lifted.
 
     `every`: False lifts, and reports, only stable and supervised grasps. `scale` replaces the
     learner's own.

@@ -233,7 +233,7 @@ def _percents(*fractions: float) -> list[str]:
 
 
 def curve_lines(curves: Curves) -> list[str]:
-    """Return a table of slips among stable / good lifts kept, in %."""
+    """Return a Markdown table by part of the day, in %: slips among stable / good lifts kept."""
     grasps = [point["grasps"] for point in curves[PUBLISHED]]
     rows = [
         [
@@ -246,7 +246,7 @@ def curve_lines(curves: Curves) -> list[str]:
 
 
 def draw(curves: Curves, *, quick: bool = False) -> str:
-    """Draw both figures by grasp of the day, as SVG."""
+    """Return an SVG of slips among `stable`, and of good lifts called so, by grasp of the day."""
     with style():
         figure = Figure(figsize=SIZE_IN, layout="constrained")
         left, right = figure.subplots(1, 2)

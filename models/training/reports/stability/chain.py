@@ -39,9 +39,9 @@ from graspd.models.training.reports.stability.readings import (
 from graspd.models.training.reports.stability.row import Row
 
 INPUT_RELATIVE_MAX = 1e-5
-"""Largest error of a reading's input over the largest magnitude in that input."""
+"""Largest allowed error of an input, over the largest magnitude in that input."""
 P_SLIP_ERROR_MAX = 1e-4
-"""Largest error of a probability. A verdict further from its threshold must not flip."""
+"""Largest allowed error of a probability. Verdicts further from the threshold must not flip."""
 THRESHOLD = 0.5
 FLOOR_MARGIN = 1e-9
 """Distance of a spread from its floor, counts, within which refused and judged are both right."""
@@ -257,7 +257,7 @@ def _relative(inputs: NDArray[np.float32], exact: Exact) -> NDArray[np.float64]:
 
 
 def _flips(p_slip: NDArray[np.float64], right: NDArray[np.float64]) -> int:
-    """Count verdicts unlike the reference's where that is off the threshold by over the bound."""
+    """Count verdicts that differ from the reference, if it is over the bound off the threshold."""
     other = (p_slip >= THRESHOLD) != (right >= THRESHOLD)
     return int((other & (np.abs(right - THRESHOLD) > P_SLIP_ERROR_MAX)).sum())
 

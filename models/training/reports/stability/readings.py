@@ -37,7 +37,7 @@ def equal(likely: Raw) -> Counts:
 
 
 def two_levels(lows: tuple[int, ...], step: float) -> Callable[[Raw], Counts]:
-    """Return a case: every other electrode is `step` above the low level; sigma is step / 2."""
+    """Return a case: a reading for each low, every other electrode `step` higher (sigma: half)."""
 
     def make(likely: Raw) -> Counts:
         counts = np.stack([np.full(likely.shape[1:], low, dtype=np.float64) for low in lows])

@@ -33,11 +33,11 @@ GRASPS = 128
 PRIOR = np.array([*np.array([0.5, 0.5, *[0.2] * INPUTS]) ** 2, *[9.009] * GRASPS])
 """Variances of the weights (of the margin, the bias and the features) and of the residual."""
 CHECKS = 100
-"""Number of checks of the covariance during the longest stream."""
+"""Number of checks of the covariance, evenly spread over the outcomes of all streams."""
 ERROR_MAX = 1e-6
 """Tolerance of a bound, slips, because it is a rounded sum of shares."""
 EIGENVALUE_MIN = 0.99 * DRIFT * 0.009
-"""Limit that the learner's docstring derives, with room for rounding."""
+"""Smallest eigenvalue of the covariance, from the learner's docstring, less 1 % for rounding."""
 ALPHAS = (0.001, 0.003, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5)
 LIFTS = 20_000
 BUDGET_ERROR_MAX = 1e-9
@@ -70,7 +70,7 @@ def constant(random: Random) -> Iterator[Outcome]:
 
 
 def at(limit: float, margin: float) -> Callable[[Random], Iterator[Outcome]]:
-    """Return a stream of features at a limit, with margins of this size."""
+    """Return a stream of features +-`limit`, margins +-`margin` and outcomes, all at random."""
 
     def stream(random: Random) -> Iterator[Outcome]:
         while True:
@@ -174,7 +174,7 @@ def beyond_the_bound(alpha: float, late: int, slips_from: float) -> float:
 
 
 def budget_row() -> Row:
-    """Compare the budget after many lifts with that of fractions."""
+    """Compare the budget after many lifts with exact arithmetic in fractions."""
     random, worst = np.random.default_rng(0), 0.0
     for alpha in (0.001, 0.05, 0.5):
         rule = Risk(RiskLimits(alpha))
