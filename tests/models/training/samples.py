@@ -19,7 +19,9 @@ TABLES = ("palm_down", "palm_side", "palm_45")
 
 
 def separable_counts(grasps: int, seed: int = 7) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:
-    """Counts (N, 3, 24) that fall along the electrodes of a stable grasp and rise in a slip."""
+    """Return counts (N, 3, 24) and labels (N,), True for a slip: every other grasp.
+
+    Counts fall along the electrodes of a stable grasp, and rise in a slip."""
     random = np.random.default_rng(seed)
     slipped = np.arange(grasps) % 2 == 1
     ramp = np.linspace(-600.0, 600.0, 24) * np.where(slipped, 1.0, -1.0)[:, None, None]
@@ -28,7 +30,9 @@ def separable_counts(grasps: int, seed: int = 7) -> tuple[NDArray[np.uint16], ND
 
 
 def table(name: str, grasps: int, seed: int, drift: int = 0) -> Grasps:
-    """Grasps of 20 objects, one object after the other; a tenth of the labels is wrong."""
+    """Return grasps of 20 objects, one object after the other; a tenth of the labels is wrong.
+
+    `drift`: counts by which electrodes 17 to 20 of the first finger are lower."""
     counts, slipped = separable_counts(grasps, seed)
     counts[:, 0, 16:20] -= np.uint16(drift)
     wrong = np.random.default_rng(seed).random(grasps) < 0.1
@@ -38,12 +42,12 @@ def table(name: str, grasps: int, seed: int, drift: int = 0) -> Grasps:
 
 
 def sessions(grasps: int) -> Grasps:
-    """Three tables of `grasps` grasps each."""
+    """Return three tables of `grasps` grasps each, of which `palm_45` has drifted."""
     return concatenate(_tables(grasps))
 
 
 def write_sessions(folder: Path, grasps: int) -> None:
-    """The same as tables in the published form."""
+    """Write the tables of `sessions` into a folder, in the published form."""
     folder.mkdir(parents=True, exist_ok=True)
     for made in _tables(grasps):
         write(folder / f"{made.files[0].name}.csv", made)
@@ -57,5 +61,5 @@ def _tables(grasps: int) -> list[Grasps]:
 
 
 def write(path: Path, made: Grasps) -> None:
-    """Grasps as a table in the published form."""
+    """Write grasps as a table in the published form."""
     write_table(path, made.counts, made.slipped, made.objects)

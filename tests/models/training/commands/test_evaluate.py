@@ -35,7 +35,7 @@ def kept(out: Path) -> int:
     return len(list((out / "jobs").rglob("output.pkl")))
 
 
-def test_a_table_of_ones_own_is_measured_alone_and_once(
+def test_an_own_table_alone_is_evaluated_and_its_results_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     own, out = tmp_path / "monday.csv", tmp_path / "out"
@@ -74,7 +74,7 @@ def test_fridays_grasps_are_judged_by_mondays_model(tmp_path: Path) -> None:
     assert (figures["all"], figures["trained_on"]) == (60, 0)
 
 
-def test_a_renamed_part_of_the_training_is_warned_of(tmp_path: Path) -> None:
+def test_judging_copied_training_grasps_prints_a_warning(tmp_path: Path) -> None:
     monday, copy, out = tmp_path / "monday.csv", tmp_path / "copy.csv", tmp_path / "out"
     write(monday, table("monday", 80, 0))
     lines = monday.read_text().splitlines(keepends=True)
@@ -97,7 +97,7 @@ def test_a_renamed_part_of_the_training_is_warned_of(tmp_path: Path) -> None:
         assert done.stdout.startswith(f"copy by {name}: ")
 
 
-def test_a_quick_run_writes_summaries_and_table(data: Path, tmp_path: Path) -> None:
+def test_a_quick_run_writes_verdicts_and_results_table(data: Path, tmp_path: Path) -> None:
     out, table = tmp_path / "out", tmp_path / "tables" / "RESULTS.md"
     options = "--data", data, "--out", out, "--table", table, "--quick"
     done = graspd("evaluate", "svm-session", *options)
@@ -136,7 +136,7 @@ def test_wrong_input_is_one_line_and_exit_code_2(data: Path, tmp_path: Path) -> 
     assert not (tmp_path / "out").exists()
 
 
-def test_no_cluster_is_exit_code_2_and_says_so(
+def test_an_unreachable_dask_scheduler_is_exit_code_2(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     distributed = pytest.importorskip("distributed", reason="needs the extra `cluster`")
@@ -153,7 +153,7 @@ def test_no_cluster_is_exit_code_2_and_says_so(
     assert "-m pip install '.[cluster]'" in graspd("evaluate", "svm", *options).stderr
 
 
-def test_ctrl_c_ends_processes_and_leaves_their_results(data: Path, tmp_path: Path) -> None:
+def test_ctrl_c_ends_processes_and_keeps_finished_trainings(data: Path, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "graspd", "evaluate", "mlp", "--protocol", "cv"]
     options = ["--data", str(data), "--out", str(tmp_path), "--jobs", "2", "--seeds", "30"]
     process = subprocess.Popen(

@@ -38,13 +38,13 @@ def train(*arguments: object, system: str = SYSTEM) -> CompletedProcess[str]:
 
 
 def last_error(done: CompletedProcess[str]) -> str:
-    """The last line of standard error, of a command that was given wrong input or data."""
+    """Return the last line of standard error of a command that has ended with exit code 2."""
     assert done.returncode == 2
     return done.stderr.splitlines()[-1]
 
 
 def smallest() -> Grasps:
-    """20 grasps of two objects, of each of which five slipped."""
+    """Return 20 grasps of two objects, ten of each, of which five slipped."""
     counts, slipped = separable_counts(20)
     objects = tuple("ball" if grasp < 10 else "box" for grasp in range(20))
     return Grasps(counts, slipped, objects, (Dataset("lab", "", 20),))
@@ -130,7 +130,7 @@ def test_the_smallest_own_table_makes_a_model(tmp_path: Path) -> None:
     assert "graspd train: warning: 20 grasps are few" in done.stderr
 
 
-def test_grasps_of_one_object_measure_known_objects_alone(tmp_path: Path) -> None:
+def test_one_object_is_measured_by_cv_in_fewer_folds(tmp_path: Path) -> None:
     """Nine of them slipped, so ten folds are too many."""
     counts, slipped = separable_counts(20)
     slipped[1] = False
@@ -144,7 +144,7 @@ def test_grasps_of_one_object_measure_known_objects_alone(tmp_path: Path) -> Non
     assert card["calibrated_by"] == "cv"
 
 
-def test_a_fold_lacks_no_kind_and_a_session_no_objects(data: Path, tmp_path: Path) -> None:
+def test_folds_lacking_a_label_or_a_tables_objects_are_refused(data: Path, tmp_path: Path) -> None:
     made, own, out = smallest(), tmp_path / "lab.csv", ("--out", tmp_path / "out")
     write_table(own, *separable_counts(GRASPS))
     last = last_error(train("--data", data, "--own", own, "--folds", "2", *out))
@@ -194,7 +194,7 @@ def test_limits_of_a_model_are_named_before_it_is_trained(
     assert warnings(train(*enough, *options)) == []
 
 
-def test_a_named_model_says_how_a_scene_gets_it(tmp_path: Path) -> None:
+def test_training_with_a_name_prints_the_scenes_model_path(tmp_path: Path) -> None:
     write(tmp_path / "lab.csv", smallest())
     path = tmp_path / "out" / "cups.onnx"
     options = "--own", tmp_path / "lab.csv", "--out", path.parent, "--folds", "2", "--only", "cv"
@@ -217,7 +217,7 @@ def test_a_system_of_fingers_that_a_table_lacks_is_refused(tmp_path: Path) -> No
     assert "small-session-ff-th" in refused.stderr
 
 
-def test_what_cannot_be_trained_is_one_line(data: Path, tmp_path: Path) -> None:
+def test_impossible_trainings_are_refused_with_exit_code_2(data: Path, tmp_path: Path) -> None:
     missing, own, some = data / "palm_45.csv", tmp_path / "lab.csv", ("--data", data)
     write_table(own, *separable_counts(GRASPS))
     missing.unlink()
@@ -238,7 +238,7 @@ def test_what_cannot_be_trained_is_one_line(data: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_a_file_that_judges_otherwise_is_exit_code_1(
+def test_a_failed_export_is_exit_code_1(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def failing(*_: object) -> None:

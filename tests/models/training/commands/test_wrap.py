@@ -29,7 +29,7 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the page's program, its network and a table of two objects."""
+    """Return a folder with RECORDING.md's program, its network and a table of two objects."""
     made = tmp_path_factory.mktemp("wrap")
     (program,) = re.findall(r"```python\n(import io, torch\n.*?)```", PAGE.read_text(), re.DOTALL)
     (made / "net.py").write_text(program)
@@ -41,7 +41,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(("file", "protocol"), [("net.py", "objects"), ("net.onnx", "table")])
-def test_a_wrapped_network_separates_what_is_separable(
+def test_a_wrapped_network_judges_separable_grasps_rightly(
     folder: Path, file: str, protocol: str
 ) -> None:
     out = folder / protocol
@@ -71,9 +71,9 @@ def wrapped(folder: Path, network: torch.nn.Module, shape: tuple[int, ...]) -> s
     return done.stderr if done.returncode else done.stdout
 
 
-def test_log_odds_of_one_column_are_those_of_slip(folder: Path) -> None:
+def test_a_networks_single_output_is_read_as_slip_log_odds(folder: Path) -> None:
     class Ramp(torch.nn.Module):
-        """The last electrode of the first finger less the first one: falls in a stable grasp."""
+        """Last electrode of the first finger less its first one: negative in a stable grasp."""
 
         def forward(self, counts: torch.Tensor) -> torch.Tensor:
             return 0.01 * (counts[:, 23:24] - counts[:, :1])

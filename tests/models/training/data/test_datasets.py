@@ -54,7 +54,7 @@ def test_a_published_table_is_read_whole(bts3_dir: Path) -> None:
         assert unpublished(grasps.files) == []
 
 
-def test_tables_of_a_folder_have_their_order(bts3_dir: Path) -> None:
+def test_a_folders_tables_are_read_in_their_fixed_order(bts3_dir: Path) -> None:
     grasps = read_all(bts3_dir)
     whole = grasps.rows(grasps.rows_of(("palm_down", "palm_side")))
     assert (len(grasps), len(whole), int(whole.slipped.sum())) == (4682, 2549, 1279)
@@ -63,7 +63,7 @@ def test_tables_of_a_folder_have_their_order(bts3_dir: Path) -> None:
     assert np.array_equal(grasps.counts[:1276], read_table(bts3_dir / "palm_down.csv").counts)
 
 
-def test_the_list_of_published_tables_agrees_with_the_record() -> None:
+def test_the_list_of_published_tables_has_recorded_rows_and_digests() -> None:
     listed = {table.name: (table.rows, table.sha256) for table in TABLES}
     assert listed == {name: (rows, sha256) for name, (rows, _, _, sha256) in REAL.items()}
     assert [table.upstream_name for table in TABLES] == [f"bts3v2_{name}.csv" for name in REAL]
@@ -79,7 +79,7 @@ def test_the_list_of_published_tables_agrees_with_the_record() -> None:
         (",1,", ",1,-", "is not a count"),
     ],
 )
-def test_a_broken_table_is_one_clear_line(
+def test_a_broken_table_is_refused_with_its_line_number(
     tmp_path: Path, before: str, after: str, message: str
 ) -> None:
     path = tmp_path / "palm_down.csv"
@@ -150,7 +150,7 @@ def refusal(lab: Sequence[Path], folder: Path | None = None) -> str:
         ("lab", (*range(80), 7), "has counts twice: the same grasp counts once"),
     ],
 )
-def test_a_lab_table_that_would_mislead_is_refused(
+def test_a_lab_table_of_bad_name_or_grasps_is_refused(
     name: str, rows: Sequence[int], problem: str, tmp_path: Path
 ) -> None:
     counts, slipped = separable_counts(80)
@@ -159,7 +159,7 @@ def test_a_lab_table_that_would_mislead_is_refused(
     assert refusal([path]) == f"{path}: {problem}"
 
 
-def test_readings_of_one_grasp_are_not_more_grasps(tmp_path: Path) -> None:
+def test_repeated_readings_of_a_grasp_count_as_one(tmp_path: Path) -> None:
     counts, slipped = separable_counts(19)
     noise = np.random.default_rng(1).normal(0.0, 3.0, (6 * 19, 3, 24))
     readings = (counts.repeat(6, axis=0) + noise).round().astype(np.uint16)

@@ -1,4 +1,4 @@
-"""Splits: sizes as published, nothing on both sides, every grasp judged once."""
+"""Splits: sizes as published, no grasp in training and test, every grasp judged once."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_every_grasp_of_a_protocol_is_judged_once_unseen(
         assert (np.diff(split.train) > 0).all()
 
 
-def test_known_objects_are_ten_even_stratified_folds_of_whole(real: Grasps) -> None:
+def test_cv_splits_palm_down_and_side_into_ten_stratified_folds(real: Grasps) -> None:
     made = splits("cv", real, seed=0)
     assert len(made) == 10
     assert {len(split.test) for split in made} == {254, 255}
@@ -76,14 +76,14 @@ def test_unknown_objects_are_the_papers_485_of_2549(real: Grasps) -> None:
 
 
 @pytest.mark.parametrize("protocol", GROUPED)
-def test_no_object_is_on_both_sides(real: Grasps, protocol: EvalProtocol) -> None:
+def test_no_object_is_in_both_training_and_test(real: Grasps, protocol: EvalProtocol) -> None:
     for split in splits(protocol, real, seed=1):
         judged = {real.objects[row] for row in split.test}
         assert 4 <= len(judged) <= 5  # 41 objects in 10 groups
         assert not judged & {real.objects[row] for row in split.train}
 
 
-def test_a_session_is_judged_by_other_days_and_objects(real: Grasps) -> None:
+def test_training_days_and_calibration_objects_are_never_those_judged(real: Grasps) -> None:
     for split in splits("session", real, seed=0):
         assert set(real.table_of[split.train].tolist()) == {0, 1}
         assert set(real.table_of[split.test].tolist()) == {2}
@@ -94,7 +94,7 @@ def test_a_session_is_judged_by_other_days_and_objects(real: Grasps) -> None:
         assert not calibrating & {real.objects[row] for row in split.test}
 
 
-def test_each_day_is_judged_by_other_days_and_other_objects(real: Grasps) -> None:
+def test_days_train_on_other_tables_and_objects_than_judged(real: Grasps) -> None:
     made = splits("days", real, seed=1)
     days = [(0, 1), (2,), (1, 2), (0, 2)], [(2,), (0, 1), (0,), (1,)]
     for split, trained, judged in zip(
@@ -128,14 +128,14 @@ def test_a_protocol_whose_table_is_missing_is_refused(protocol: EvalProtocol) ->
 
 
 @pytest.mark.parametrize("protocol", ["cv", "objects", "objects-whole"])
-def test_own_tables_alone_are_all_data(protocol: EvalProtocol) -> None:
+def test_every_grasp_is_judged_if_all_tables_are_own(protocol: EvalProtocol) -> None:
     grasps = concatenate([table("monday", 100, 0), table("friday", 60, 1)])
     judged = np.concatenate([split.test for split in splits(protocol, grasps, seed=0)])
     assert sorted(judged.tolist()) == list(range(160))
 
 
 @pytest.mark.parametrize("protocol", ["unknown", "session"])
-def test_figures_of_published_tables_take_no_other(protocol: EvalProtocol) -> None:
+def test_unknown_and_session_protocols_ignore_lab_tables(protocol: EvalProtocol) -> None:
     alone = splits(protocol, sessions(100), seed=0)
     beside = splits(protocol, concatenate([sessions(100), table("lab", 100, 3)]), seed=0)
     for one, other in zip(alone, beside, strict=True):
@@ -172,8 +172,8 @@ def test_readings_of_one_grasp_stay_in_one_fold() -> None:
 
 
 @pytest.mark.parametrize("step", [4.0, 12.0])
-def test_readings_of_a_grasp_are_joined_near_by_near(step: float) -> None:
-    """Groups are those of scipy from all distances: RMS 8 counts over 72 electrodes."""
+def test_readings_linked_by_near_readings_form_one_grasp(step: float) -> None:
+    """Groups are connected components, by scipy, of pairs with an RMS difference up to 8 counts."""
     random, rows = np.random.default_rng(4), 300
     walk = np.cumsum(random.normal(0.0, step / np.sqrt(2), (rows, 72)), axis=0) % 4096
     counts = random.permutation(walk).astype(np.uint16)

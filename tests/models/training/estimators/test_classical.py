@@ -21,7 +21,7 @@ VECTORS = VectorBuilder(3).build_batch(COUNTS)[0]
 
 
 def test_a_unanimous_forest_has_a_finite_margin() -> None:
-    """All trees agree: 0.999 and 0.001, log-odds 6.9068."""
+    """All trees agree, so probabilities are clipped to 0.001 and 0.999: log-odds +-6.9068."""
     fitted = fit_classical(ForestConfig(11, None), VECTORS, SLIPPED, seed=0)
     assert np.abs(fitted.margins(VECTORS)).max() == pytest.approx(6.90675, abs=1e-4)
 
@@ -35,7 +35,7 @@ def test_a_perceptron_counts_its_weights_and_keeps_large_margins() -> None:
 
 
 def test_classes_weigh_the_same_however_many_grasps_each_has() -> None:
-    """Nine in ten grasps slip: a stable grasp may pull nine times as hard."""
+    """Nine in ten grasps slip, so a stable grasp may weigh nine times as much."""
     random = np.random.default_rng(0)
     inputs = random.normal(size=(400, 72)).astype(np.float32)
     slipped = np.arange(400) % 10 > 0
@@ -44,7 +44,7 @@ def test_classes_weigh_the_same_however_many_grasps_each_has() -> None:
     assert weights.max() / weights.min() == pytest.approx(9.0, rel=0.01)
 
 
-def test_images_and_a_single_class_are_refused() -> None:
+def test_fitting_images_or_a_single_class_is_refused() -> None:
     images, slipped = np.zeros((4, 12, 11, 3), np.float32), np.ones(120, np.bool_)
     with pytest.raises(ValueError, match="takes vectors"):
         fit_classical(SvmConfig(1.0, 0.1), images, SLIPPED[:4], seed=0)

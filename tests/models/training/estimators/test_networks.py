@@ -90,7 +90,7 @@ def test_weights_start_as_in_keras() -> None:
             assert layer.eps == 1e-3
 
 
-def test_features_become_the_filled_image_and_the_rest_stands_beside() -> None:
+def test_z_values_become_filled_images_and_other_features_pass_unchanged() -> None:
     features = np.random.default_rng(5).integers(1, 4096, (3, 78)).astype(np.float32)
     network = build(NetworkConfig(filters=4, hidden=8), FEATURES).eval()
     beside = network[0]
@@ -124,7 +124,7 @@ def test_the_seed_alone_decides_the_weights() -> None:
     assert _weights(train_network(TINY, IMAGES, SLIPPED, QUICK, seed=2)) != trained
 
 
-def test_training_leaves_torch_as_it_was() -> None:
+def test_training_restores_torchs_threads_and_random_state() -> None:
     threads, state = torch.get_num_threads(), torch.random.get_rng_state()
     train_network(TINY, IMAGES, SLIPPED, Recipe(epochs=1, threads=threads + 1), seed=1)
     assert torch.get_num_threads() == threads
@@ -175,7 +175,7 @@ def test_the_published_recipe_updates_as_keras_does(monkeypatch: pytest.MonkeyPa
     ("recipe", "momentum"),
     [(Recipe(epochs=1, batch=160), 0.1), (PublishedRecipe(epochs=1, batch=160), 0.01)],
 )
-def test_batch_norm_remembers_as_the_recipe_says(
+def test_batch_norm_has_the_momentum_of_the_recipe(
     recipe: Recipe | PublishedRecipe, momentum: float
 ) -> None:
     with reproducible(seed=4), torch.no_grad():
@@ -213,7 +213,7 @@ def test_an_epoch_sees_each_grasp_at_most_once(
     assert len(rows) == sum(map(len, batches)) == seen
 
 
-def test_drawn_days_change_what_is_learned(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_day_shifts_change_the_weights_reproducibly(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(networks, "build", lambda *_: plain_network(26))
     features = np.random.default_rng(0).normal(size=(len(SLIPPED), 26)).astype(np.float32)
     shifted = SessionRecipe(epochs=2)
@@ -235,7 +235,7 @@ def test_weight_decay_spares_biases_and_norms() -> None:
 
 
 def shifted(features: torch.Tensor, *shift: float) -> torch.Tensor:
-    """The features on another day, by these gain, finger gain and offset."""
+    """Return features as on another day. `shift`: gain, finger gain and offset."""
     torch.manual_seed(0)
     return on_another_day(features, DayShift(*shift))
 
@@ -246,7 +246,7 @@ def test_each_feature_of_a_grasp_has_its_own_gain() -> None:
     assert torch.corrcoef(exponents.T).fill_diagonal_(0.0).abs().max() < 0.1
 
 
-def test_a_finger_gain_is_of_its_24_electrodes_alone() -> None:
+def test_a_finger_gain_scales_that_fingers_24_electrodes_alone() -> None:
     features = shifted(torch.ones(4000, 52), 0.0, 0.3, 0.0)
     ff, th, rest = features[:, :24], features[:, 24:48], features[:, 48:]
     assert torch.equal(ff, ff[:, :1].expand(-1, 24))
@@ -256,7 +256,7 @@ def test_a_finger_gain_is_of_its_24_electrodes_alone() -> None:
     assert torch.equal(rest, torch.ones(4000, 4))
 
 
-def test_an_offset_is_of_means_and_spreads_alone() -> None:
+def test_the_day_offset_moves_means_and_spreads_alone() -> None:
     features = shifted(torch.zeros(4000, 26), 0.0, 0.0, 0.7)
     assert torch.equal(features[:, :24], torch.zeros(4000, 24))
     assert features[:, 24:].std(dim=0).numpy() == pytest.approx(0.7, abs=0.04)

@@ -66,7 +66,7 @@ def cluster() -> Iterator[str]:
 
 
 def same(one: pd.DataFrame, other: pd.DataFrame) -> bool:
-    """All but the time that it took."""
+    """True if two tables of verdicts are equal, except for their `seconds`."""
     assert list(one) == list(other)
     return bool(one.drop(columns="seconds").equals(other.drop(columns="seconds")))
 
@@ -76,7 +76,7 @@ def rows() -> pd.DataFrame:
     return judged(SESSION_JOB, GRASPS)
 
 
-def test_everything_that_changes_the_verdicts_is_a_cause() -> None:
+def test_the_cache_key_has_everything_that_changes_verdicts() -> None:
     job = Job(SVM, "cv", 0, 0)
     others = [
         dataclasses.replace(job, system=dataclasses.replace(SVM, estimator=SvmConfig(3.0, 0.02))),
@@ -92,7 +92,7 @@ def test_everything_that_changes_the_verdicts_is_a_cause() -> None:
     assert renamed.causes("data") == job.causes("data")
 
 
-def test_the_labels_of_the_test_grasps_are_not_looked_at(rows: pd.DataFrame) -> None:
+def test_labels_of_the_judged_session_do_not_change_verdicts(rows: pd.DataFrame) -> None:
     slipped = GRASPS.slipped.copy()
     slipped[GRASPS.table_of == 2] ^= True
     assert same(rows, judged(SESSION_JOB, dataclasses.replace(GRASPS, slipped=slipped)))
@@ -106,7 +106,7 @@ def test_only_a_session_system_is_judged_in_several_ways(rows: pd.DataFrame) -> 
     assert set(judged(Job(SESSION_SVM, "cv", 0, 1, 4), GRASPS)["variant"]) == {"training"}
 
 
-def test_calibration_repairs_a_drifted_session(rows: pd.DataFrame) -> None:
+def test_session_calibration_reaches_good_accuracy_despite_drift(rows: pd.DataFrame) -> None:
     right = (rows["margin"] > 0.0) == GRASPS.slipped[rows["grasp"]]
     accuracy = right.groupby(rows["variant"]).mean()
     assert (accuracy[["n50", "all", "running"]] > 0.8).all()  # a tenth of the labels is wrong
@@ -120,7 +120,7 @@ def test_days_are_judged_with_refusals_and_session_ages() -> None:
         assert ages.is_unique  # one table, each grasp learned
 
 
-def test_an_interrupted_sweep_continues_and_runs_nothing_twice(
+def test_an_interrupted_evaluation_continues_and_repeats_no_training(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     ran: list[Job] = []
@@ -146,7 +146,7 @@ def test_an_interrupted_sweep_continues_and_runs_nothing_twice(
     assert all(same(again[job], results[job]) for job in JOBS)
 
 
-def test_a_cluster_gives_what_this_computer_gives(tmp_path: Path) -> None:
+def test_a_dask_cluster_gives_the_same_rows_as_this_computer(tmp_path: Path) -> None:
     distributed = pytest.importorskip("distributed", reason="needs the extra `cluster`")
     with (
         cluster() as address,
@@ -158,12 +158,12 @@ def test_a_cluster_gives_what_this_computer_gives(tmp_path: Path) -> None:
     assert all(same(found[job], here[job]) for job in JOBS)
 
 
-def test_a_killed_process_ends_the_run() -> None:
+def test_a_killed_worker_raises_lost_worker_error() -> None:
     with pytest.raises(LostWorkerError, match="a process was killed"), processes(1):
         raise TerminatedWorkerError
 
 
-def test_an_interrupted_training_is_not_a_result(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_within_a_fit_stops_the_training(monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
@@ -174,7 +174,7 @@ def test_an_interrupted_training_is_not_a_result(monkeypatch: pytest.MonkeyPatch
         judged(Job(system, "cv", 0, 0, 4), GRASPS)
 
 
-def test_dead_electrodes_cost_less_once_they_are_repaired() -> None:
+def test_dead_electrodes_cost_less_once_replaced_by_estimates() -> None:
     study = broken_study(SYSTEMS["svm-session"], sessions(150), seed=1)
     assert len(study["broken"]) == len(KINDS) * len(NUMBERS)
     assert study["grasps"] == 135

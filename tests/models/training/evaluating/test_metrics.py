@@ -41,7 +41,7 @@ def test_spread_over_folds_and_error_over_seeds() -> None:
     assert math.isnan(over_seeds(np.array([[math.nan, math.nan]])).mean)
 
 
-def test_differences_of_overlapping_trainings_are_less_sure_than_they_look() -> None:
+def test_the_error_of_differences_accounts_for_overlapping_trainings() -> None:
     gaps = np.array([0.03, 0.01, 0.02, 0.04])
     # Mean 2.5 points, variance 5/3. Ten folds: test/train = 1/9.
     mean, error = paired_difference(gaps, 1.0 / 9.0)
@@ -53,13 +53,15 @@ def test_differences_of_overlapping_trainings_are_less_sure_than_they_look() -> 
 
 
 def right_of(*objects: list[int]) -> tuple[pd.Series, pd.Series, pd.Series]:
-    """Arguments of `interval`, a row per verdict: 1 if right, 1, number of its object."""
+    """Return arguments of `interval`, a row per verdict: 1 if right else 0; 1; object's number.
+
+    `objects`: for each object, 1 for a right verdict and 0 for a wrong one."""
     names = np.repeat(np.arange(len(objects)), [len(verdicts) for verdicts in objects])
     right = pd.Series(np.concatenate(objects))
     return right, pd.Series(np.ones(len(right))), pd.Series(names)
 
 
-def test_an_interval_is_that_of_the_objects() -> None:
+def test_the_interval_comes_from_drawing_objects_not_grasps() -> None:
     # Objects that are judged alike tell nothing of others: 3 of 4 each.
     assert interval(*right_of(*[[1, 1, 1, 0]] * 30)) == (0.75, 0.75)
     # Forty objects, of which ten are always judged wrongly: as forty draws of a coin of 3/4.
@@ -69,7 +71,7 @@ def test_an_interval_is_that_of_the_objects() -> None:
     assert (low, high) == interval(*right_of(*[[1] * 500] * 30, *[[0] * 500] * 10))
 
 
-def test_the_curve_of_six_verdicts_worked_out_by_hand() -> None:
+def test_the_coverage_curve_of_six_verdicts_equals_hand_calculation() -> None:
     curve = coverage_curve(PROBABILITY, SLIPPED, steps=6)
     assert [point.confidence for point in curve] == pytest.approx(
         [0.99, 0.95, 0.90, 0.80, 0.70, 0.60]
@@ -92,7 +94,7 @@ def test_accuracy_at_a_coverage_is_that_of_the_surest() -> None:
 
 
 def test_scores_take_slip_for_positive() -> None:
-    """What scikit-learn counts from there on is its own."""
+    """Only the choice of the positive class is tested; formulas are those of scikit-learn."""
     # Verdicts slip, slip, slip, stable, stable against slip, slip, stable, slip, stable.
     values = np.array([1.0, 2.0, 3.0, -1.0, -2.0])
     slipped = np.array([True, True, False, True, False])
@@ -114,7 +116,7 @@ def test_the_temperature_that_made_the_labels_is_found(true_temperature: float) 
 
 
 @pytest.mark.parametrize(("sign", "end"), [(1.0, 0.05), (-1.0, 20.0)])
-def test_labels_without_overlap_end_at_a_bound(sign: float, end: float) -> None:
+def test_the_temperature_of_separable_labels_ends_at_a_bound(sign: float, end: float) -> None:
     margins = sign * np.array([-1.0, 1.0, -2.0, 3.0])
     slipped = np.array([False, True, False, True])
     assert fit_temperature(margins, slipped) == pytest.approx(end)
@@ -143,7 +145,7 @@ def test_a_fold_is_calibrated_by_the_other_folds_alone() -> None:
     assert not before[fold_of == 0].equals(after[fold_of == 0])
 
 
-def test_verdicts_are_counted_by_what_they_cost() -> None:
+def test_verdict_figures_of_ten_grasps_equal_hand_calculation() -> None:
     slipped = np.array([True] * 4 + [False] * 6)
     called = np.array([True, True, True, False, True, True, False, False, False, False])
     figures = verdict_figures(pd.DataFrame({"slipped": slipped, "margin": called - 0.5}))

@@ -42,7 +42,7 @@ def margins_of(name: str, wrong: float) -> NDArray[np.float64]:
 
 
 def figures_of(name: str, protocol: EvalProtocol, wrong: float, seeds: int = 2) -> Figures:
-    """A system that is wrong on this share of the grasps, at random."""
+    """Return figures of a system that is wrong on the share `wrong` of the grasps, at random."""
     margins = margins_of(name, wrong)
     several = ("none", "n50", "running") if protocol == "session" else ("none",)
 
@@ -112,7 +112,9 @@ def test_streams_and_refused_grasps_are_counted_apart() -> None:
     assert found["all"]["every"]["slips_called_stable"] == pytest.approx(slips / every)
 
 
-def test_rows_come_back_from_their_file(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_written_figures_are_read_and_foreign_files_left_out(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     made = figures_of("cnn1", "cv", wrong=0.1)
     write(made, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["cnn1.cv.parquet"]
@@ -178,7 +180,7 @@ def test_every_published_row_is_there_even_if_nothing_was_run() -> None:
         assert [f"`{system}`", f"`{protocol}`", figure, paper, "-", "-"] in shown
 
 
-def test_the_results_table_names_sessions_by_their_grasps() -> None:
+def test_the_session_table_has_f1_by_number_of_calibration_grasps() -> None:
     ours = figures_of("svm-session", "session", wrong=0.2)
     assert ours.headline == "n50"
     assert list(by_age(ours.of_variant("running"))) == [0, 5, 10, 20]

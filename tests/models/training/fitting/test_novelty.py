@@ -1,4 +1,4 @@
-"""What the training counts look like, against numpy; and what is refused by it."""
+"""Description of training counts, against numpy, and the readings that it refuses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A session is calibrated honestly, and as the daemon does it."""
+"""A session is calibrated without the judged grasps, and as the daemon does it."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_training_rows_are_standardised_by_their_own_table() -> None:
         training.each(np.array([1, 1, 1, 1]))
 
 
-def test_a_running_session_judges_by_earlier_grasps() -> None:
+def test_a_running_session_is_standardised_by_earlier_grasps() -> None:
     random = np.random.default_rng(1)
     features = random.normal(50.0, 4.0, (60, 3))
     training = TrainingStandards.of(features[:20], np.zeros(20, dtype=np.int64))
@@ -64,7 +64,7 @@ def test_a_running_session_judges_by_earlier_grasps() -> None:
     assert mixed.tolist() != [5, 6, 7, 8, 9]
 
 
-def test_the_pool_alone_calibrates_a_session() -> None:
+def test_judged_grasps_do_not_calibrate_their_session() -> None:
     features = np.random.default_rng(1).normal(50.0, 4.0, (60, 3))
     training = TrainingStandards.of(features[:20], np.zeros(20, dtype=np.int64))
     test, pool = np.arange(20, 30), np.arange(30, 60)

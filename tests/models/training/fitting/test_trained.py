@@ -64,7 +64,7 @@ IMAGES = np.random.default_rng(3).normal(size=(20, 12, 11, 3)).astype(np.float32
 
 
 @pytest.mark.parametrize("kind", sorted(SYSTEMS_MADE))
-def test_every_kind_learns_and_repeats_itself(kind: str) -> None:
+def test_every_kind_of_system_learns_reproducibly(kind: str) -> None:
     system = SYSTEMS_MADE[kind]
     fitted = fit(system, INPUTS, SLIPPED, seed=1)
     inputs, slipped = _features(80, seed=8)
@@ -96,8 +96,8 @@ def test_a_blend_is_the_weighted_mean_of_standardised_margins() -> None:
     assert blend.parameters == sum(member.parameters for member in blend.members)
 
 
-def test_a_member_that_judges_all_grasps_alike_has_no_say() -> None:
-    """No leaf can hold 200 of 160 grasps: the boosting is a constant."""
+def test_a_blend_member_with_constant_margin_gets_no_weight() -> None:
+    """No leaf can hold 200 of 160 grasps, so the boosting's margin is constant."""
     useless = Member(BoostingConfig(iterations=5, leaf_grasps=200))
     blend = BlendConfig((useless, Member(SvmConfig(3.0, 0.003))))
     fitted = fit(replace(MADE, estimator=blend), INPUTS, SLIPPED, seed=0)
@@ -138,7 +138,7 @@ def test_every_kind_of_system_by_name_can_be_trained() -> None:
         assert np.isfinite(fitted.margins(inputs)).all(), system.name
 
 
-def test_each_grasp_comes_back_four_times_flipped_both_ways() -> None:
+def test_augmentation_returns_each_image_unchanged_then_flipped_both_ways() -> None:
     images, slipped = augment(IMAGES, SLIPPED[:20], Augmentation(), seed=0)
     assert images.shape == (80, 12, 11, 3)
     assert images.dtype == np.float32
@@ -183,7 +183,7 @@ def test_a_session_model_maps_drifted_tables_to_one_another() -> None:
     assert trained.seen().margin == SESSION_MARGIN_COUNTS
 
 
-def test_other_models_take_the_counts_as_they_are() -> None:
+def test_systems_without_session_take_counts_unchanged() -> None:
     grasps = sessions(40)
     trained = train(SYSTEMS["svm"], grasps, 0)
     np.testing.assert_array_equal(trained.mapped(grasps.counts, grasps.table_of), grasps.counts)

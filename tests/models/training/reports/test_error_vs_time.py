@@ -1,4 +1,4 @@
-"""`graspd report error-vs-time`: every model is in its figures, tables and error_vs_time."""
+"""`graspd report error-vs-time`: every model is in its figures, and the page is updated."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from graspd.models.training.reports.candidates import errors, loop_image, measur
 from tests.kit.inside import graspd
 
 WHOLE_S = 300.0
-"""A quick report takes a quarter of a minute, and many on a busy machine."""
+"""Timeout of a test, s. A quick report takes 15 s, and minutes on a busy machine."""
 pytestmark = [
     pytest.mark.timeout(WHOLE_S),
     pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning"),  # of Keras
@@ -30,7 +30,7 @@ pytestmark = [
 
 @pytest.fixture(autouse=True, scope="module")
 def fonts() -> None:
-    """Matplotlib opens its fonts once, and keeps them open."""
+    """Let matplotlib open its fonts, which it keeps open, before any test."""
     figure = Figure()
     figure.subplots().set_xscale("log")
     for style, weight in (("normal", "bold"), ("italic", "normal")):
@@ -71,7 +71,9 @@ def test_the_report_has_error_and_time_of_every_model(
     assert {row["kind"] for row in found["rows"]} == {"model", "peer"}
 
 
-def test_a_page_has_the_table_of_the_whole_hand(folder: Path, found: dict[str, Any]) -> None:
+def test_a_page_lists_whole_hand_models_the_fastest_first(
+    folder: Path, found: dict[str, Any]
+) -> None:
     page = (folder / "page.md").read_text()
     assert page.startswith("Above.\n\n**made with --quick")
     assert page.endswith("`graspd report error-vs-time`\n\nBelow.\n")
@@ -92,7 +94,7 @@ def test_a_quick_report_says_so_and_on_which_machine(folder: Path, found: dict[s
     assert "Error and run time" in drawn
 
 
-def test_an_interval_is_nadeaus_and_bengios() -> None:
+def test_the_f1_interval_equals_nadeau_and_bengio_by_hand() -> None:
     figures = {
         "folds": 10,
         "train_grasps": 900.0,
@@ -108,7 +110,7 @@ def test_an_interval_is_nadeaus_and_bengios() -> None:
     assert found["f1"] - found["low"] == pytest.approx(0.010394, abs=2e-6)
 
 
-def test_the_published_loops_make_the_same_image() -> None:
+def test_the_published_loops_make_the_same_image_as_graspd() -> None:
     counts = np.random.default_rng(0).integers(500, 3500, (3, 24), dtype=np.uint16)
     expected, _ = TactileImager(3).build_batch(counts[np.newaxis])
     np.testing.assert_allclose(loop_image(counts), expected[0], atol=1e-5)

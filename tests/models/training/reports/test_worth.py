@@ -44,7 +44,7 @@ LIMITS = limits(ALLOWED)
 
 
 def stream(seed: int = 0) -> Stream:
-    """A network whose margin knows little, and features that tell the outcome."""
+    """Return a stream with margins unrelated to outcomes, and a first feature that shows them."""
     random = np.random.default_rng(seed)
     slipped = random.random(GRASPS) < 0.5
     features = random.normal(0.0, 1.0, (GRASPS, 6)).astype(np.float32)
@@ -136,7 +136,7 @@ def test_networks_saw_neither_objects_nor_poses_of_their_streams(
     }
 
 
-def test_a_refused_grasp_counts_as_not_kept() -> None:
+def test_a_good_grasp_that_is_refused_counts_as_not_stable() -> None:
     whole = stream()
     refused = np.arange(GRASPS) % 2 == 0
     life = live(changed(whole, refused=refused), RiskLimits(), every=True)
@@ -152,7 +152,7 @@ def test_a_refused_grasp_counts_as_not_kept() -> None:
     assert figures["above"] == 1.0
 
 
-def test_probabilities_that_are_timid_or_too_sure_have_that_slope() -> None:
+def test_the_slope_finds_the_factor_that_shrank_the_log_odds() -> None:
     random = np.random.default_rng(0)
     log_odds = random.normal(0.0, 2.0, 40_000)
     slipped = random.random(40_000) < 1.0 / (1.0 + np.exp(-log_odds))

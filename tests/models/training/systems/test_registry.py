@@ -27,7 +27,7 @@ ALL_DIGESTS = "0541cffd27d347520bfb49fa2ca88e4be2efca68d951727692330768eff543aa"
 that hours of training run again."""
 
 
-def test_stored_results_of_every_system_stay_valid() -> None:
+def test_digests_of_all_systems_are_unchanged() -> None:
     lines = [f"{name} {digest(system)[:16]}\n" for name, system in SYSTEMS.items()]
     assert hashlib.sha256("".join(lines).encode()).hexdigest() == ALL_DIGESTS
 
@@ -58,7 +58,7 @@ def test_every_smaller_hand_has_a_default_system() -> None:
         assert digest(replace(system, fingers=whole.fingers)) == digest(whole)
 
 
-def test_what_the_other_fingers_feel_changes_nothing() -> None:
+def test_counts_of_fingers_that_a_system_lacks_change_nothing() -> None:
     grasps = sessions(120)
     other = replace(grasps, counts=grasps.counts.copy())
     other.counts[:, 1] = 3000
