@@ -102,7 +102,7 @@ def worth_of(several: Sequence[Stream], command: str) -> Figures:
     """Run `live` on all streams, with scales fitted on other objects; return the figures.
 
     `risk` is by target and day, `warm_up` by its length at a target of `ALLOWED`, `days` F1 of
-    the judged grasps of a day without outcomes (`alone`) and with.
+    the judged grasps of a day without outcomes (`alone`) and with them (`learning`).
     """
     unscaled = [live(one, RiskLimits(), every=True, scale=1.0) for one in several]
     scales = fitted_scales(pd.concat(unscaled))
