@@ -1,4 +1,4 @@
-"""The command line: a parser that suggests what was probably meant, and numbers."""
+"""Parser of command lines that suggests the likely word for a mistyped one; shared options."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class UsageError(Exception):
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that takes options and files in any order, and corrects a mistyped word."""
+    """A parser that takes options and files in any order; its errors suggest the likely word."""
 
     _is_intermixing = False
     """True while argparse parses options and files in two passes."""
@@ -29,12 +29,12 @@ class Parser(argparse.ArgumentParser):
 
     @property
     def subparsers(self) -> Mapping[str, Parser]:
-        """Parsers of its subcommands by name."""
+        """Parsers of the subcommands by name; empty without any."""
         choices = (action.choices for action in self._actions)
         return next((each for each in choices if isinstance(each, Mapping)), {})
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:  # noqa: ANN401
-        """Parse. An unknown option is reported before a missing argument."""
+        """Parse as argparse does, but report an unknown option before a missing argument."""
         words: Sequence[str] = sys.argv[1:] if args is None else args
         is_mine = (lambda word: word.startswith("-")) if self.subparsers else lambda _word: True
         for word in takewhile(lambda word: word != "--" and is_mine(word), words):
@@ -76,7 +76,7 @@ def within(lowest: float, highest: float) -> Callable[[str], float]:
 
 
 def add_reading(parser: argparse.ArgumentParser) -> None:
-    """Declare the options that decide how a table is read."""
+    """Declare `--as` and `--rate-hz`, which decide how a table is read."""
     parser.add_argument(
         "--as",
         dest="read_as",

@@ -58,8 +58,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Check the scenes, their models and files; 0 if all are right. Warn of what they share.
-    `graspd doctor` checks sockets and devices."""
+    """Check the scenes, their models and files; return 0 if all are right, else 2. Warn of what two
+    scenes share. Devices are not opened: `graspd doctor` examines them."""
     checked = {path: _check(path, as_json=args.json) for path in args.scene}
     right = [(path, wanted) for path, wanted in checked.items() if wanted is not None]
     for (path, first), (other, second) in itertools.combinations(right, 2):
@@ -84,7 +84,7 @@ def _endpoints(wanted: scene.Scene) -> list[str]:
 
 
 def _taken(wanted: scene.Scene) -> Iterator[tuple[str, str]]:
-    """Yield the key and the name of each resource that a running scene has for itself."""
+    """Yield key and name of each resource, but endpoints, that a running scene has for itself."""
     yield "hand.name", wanted.hand.name
     if wanted.keeps_session:
         yield "session.folder", os.path.realpath(wanted.session_path)
@@ -101,7 +101,7 @@ def _devices(wanted: scene.Scene) -> Iterator[tuple[str, Device]]:
 
 
 def _check(path: Path, *, as_json: bool) -> scene.Scene | None:
-    """Check one scene and print the result. Return it if it is right."""
+    """Check one scene and print the result. Return the scene; None if it is wrong."""
     try:
         wanted = scene.load(path)
         model = assembly.load_model(wanted)
@@ -157,7 +157,7 @@ def _warnings(wanted: scene.Scene) -> Iterator[str]:
 
 
 def _unreachable(what: str, name: str, path: str) -> Iterator[str]:
-    """Yield why a device cannot be opened now."""
+    """Yield a warning if the `path` of a device is missing or out of reach; `what`: its kind."""
     try:
         os.stat(path)
     except PermissionError:
@@ -249,7 +249,7 @@ def _gate(wanted: scene.Scene, limits: HandLimits | None) -> str:
 
 
 def _still(wanted: scene.Scene, gate: GateLimits, period_ns: int | None) -> str:
-    """Return in words after what time a grasp is judged."""
+    """Return text on the time after which a grasp is judged; `period_ns` None: a usual one."""
     usual = ", as usual" if period_ns is None else ""
     period_ns = period_ns or USUAL_PERIOD_NS
     step_ns = max(math.ceil(STEP_NS / period_ns), 1) * period_ns

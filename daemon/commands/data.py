@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _get(args: argparse.Namespace, file: TableFile) -> str:
-    """Get one file unless it is there; return what was done."""
+    """Get one file unless it is there unchanged; return text on what was done."""
     target: Path = args.to / f"{file.name}.csv"
     args.to.mkdir(parents=True, exist_ok=True)
     if target.exists():

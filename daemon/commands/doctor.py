@@ -47,11 +47,11 @@ COLOURS = {"ok ": Colour.GREEN, "!  ": Colour.YELLOW, "!! ": Colour.RED}
 NARROWEST = 40
 """Fewest columns to which lines are wrapped."""
 WHOLE_DEVICE = frozenset({Cause.SENSOR_ABSENT, Cause.REPEATED, Cause.CLOCK})
-"""Faults of a device that explain why no touch is detected. `FRAMES_LOST` as an error does too."""
+"""Faults of a whole device that make all fingers seem absent; `FRAMES_LOST` as an error too."""
 FINGER_COLUMNS = 25
-"""Width of a finger in the table of electrodes."""
+"""Width of a finger in the table of electrodes, characters."""
 USUAL_COLUMNS = 80
-"""Width of that table where there is no terminal."""
+"""Width of the table of electrodes where there is no terminal, characters."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -124,7 +124,7 @@ def examine(
 
 
 def in_words(findings: Sequence[Finding], columns: int | None) -> Iterator[str]:
-    """Yield the findings in lines of at most `columns`; with None, one line each."""
+    """Yield the findings in lines of at most `columns` (None: one line each), then their counts."""
     for finding in findings:
         what, mark = printable(finding.what), MARKS[finding.level]
         advice = printable(finding.advice or "")
@@ -146,7 +146,7 @@ def in_words(findings: Sequence[Finding], columns: int | None) -> Iterator[str]:
 
 
 def _computer(report: dict[str, Any], listen_s: float) -> list[Finding]:
-    """Look for bridges and CAN interfaces on this computer."""
+    """Return findings on the bridges and CAN interfaces of this computer; fill in `report`."""
     ports = [port for port in computer.serial_ports() if port.vendor is not None]
     interfaces = computer.can_interfaces()
     report["ports"] = [dataclasses.asdict(port) for port in ports]
@@ -217,7 +217,7 @@ def _listen(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> lis
 
 
 def _collect(drivers: Sequence[Driver], statistics: ElectrodeStatistics, listen_s: float) -> float:
-    """Feed the statistics for `listen_s`; return the readings' number times mean period, s."""
+    """Feed readings to `statistics` for `listen_s`; return their number times mean period, s."""
     start_s = first_s = last_s = time.monotonic()
     while drivers and time.monotonic() - start_s < listen_s and not drivers[0].exhausted:
         poll = select.poll()

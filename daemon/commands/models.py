@@ -28,16 +28,16 @@ TITLES = {
     "session": "other objects, another day",
     "days": "other objects, each day by others",
 }
-"""Meaning of each protocol, for people."""
+"""Meaning, in words for users, of each protocol of evaluation."""
 SHOWN = {
     "known objects": ("cv",),
     "other objects": ("objects", "objects-whole"),
     "another day": ("session",),
     "each other day": ("days",),
 }
-"""Columns of the list: the first of these protocols that a card has."""
+"""Columns of the list by title; each shows the first of its protocols that a card has."""
 SYSTEMS = "graspd.models.training.systems.registry"
-"""Module with what can be trained; it needs no library of the training."""
+"""Module that names the systems that can be trained; it imports no library of the training."""
 LEFT_COLUMNS = 2
 """Columns of the list that begin at the left: name and fingers."""
 
@@ -93,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _content_of(what: str) -> dict[str, Any]:
-    """Return the card of a name or a file, as it is."""
+    """Return the unchecked card of a model, by name or file. Raises `ModelError`."""
     if what in zoo.names():
         return _card_of(zoo.find(what))
     if what in importlib.import_module(SYSTEMS).SYSTEMS:
@@ -130,7 +130,7 @@ class _ShownCard(msgspec.Struct):
 
 
 def _parsed(content: dict[str, Any]) -> _ShownCard:
-    """Raise `ModelError` if a part that is shown has another form."""
+    """Return the shown fields of a card. Raises `ModelError` if one has another form."""
     try:
         return msgspec.convert(content, _ShownCard)
     except msgspec.ValidationError as error:

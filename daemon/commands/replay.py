@@ -160,7 +160,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Replay; 0 when the recordings were played to their end, 1 when nothing was judged."""
+    """Replay; return 0 at the end, 1 if nothing was judged, 128 + its number after a signal."""
     if args.wait is not None and args.publish is None:
         raise UsageError("--wait is for subscribers: it needs --publish")
     if args.publish is not None:
@@ -233,7 +233,7 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
 
 
 def _shows_table(args: argparse.Namespace, source: Source, parts: Parts) -> bool:
-    """Return True if each reading is a grasp with an outcome, so that the two methods compare."""
+    """Return True to print a table of two methods: for users, and grasps that have outcomes."""
     fingers = parts.model.contract.fingers
     if args.json or args.verbose or not isinstance(source, Tables) or fingers != TABLE_FINGERS:
         return False

@@ -138,7 +138,7 @@ def _readable(found: Found) -> dict[int, KeptSession]:
 def _continued(
     wanted: scene.Scene, model: TactileModel, sessions: dict[int, KeptSession]
 ) -> tuple[dict[int, KeptSession], bool]:
-    """Return the sessions, those that a start continues first; True if it would be calibrated."""
+    """Return the sessions, first what a start continues; True if that start is calibrated."""
     pipeline = assembly.build_pipeline(Plan.of(wanted), model)
     fingers, kept = tuple(wanted.hand.fingers), list(sessions.values())
     used, learned, problems = continue_kept(pipeline, fingers, newest_of_each(kept))
@@ -206,7 +206,7 @@ def _learned(state: TrustState | None) -> dict[str, Any] | None:
 
 
 def _seed(wanted: scene.Scene, model: TactileModel, played: scene_drivers.ReplayTactile) -> None:
-    """Judge the recordings as the daemon does, report their outcomes, and keep the session."""
+    """Judge recordings, learn from their outcomes, keep the session. Raises `DriverError`."""
     mode: GateMode | None = "every" if kind_of_all(played.recordings) is Kind.MCAP else None
     plan = Plan.of(_on_recordings(wanted, played, mode))
     pipeline = assembly.build_pipeline(plan, model)
@@ -343,7 +343,7 @@ def _check(plan: Plan, model: TactileModel, state: SessionState) -> None:
 def _on_recordings(
     wanted: scene.Scene, recordings: scene_drivers.ReplayTactile, mode: GateMode | None
 ) -> scene.Scene:
-    """Return the scene with recordings in place of its sensors, and without `[risk]`."""
+    """Return the scene with recordings for sensors, `mode` of the gate, and no `[risk]`."""
     max_age_ms = assembly.NO_SILENCE_NS / 1e6  # a recorded reading is never late
     gate = wanted.gate.model_copy(update={"mode": mode, "max_age_ms": max_age_ms})
     changes = {"tactile": recordings, "joints": None, "gate": gate, "risk": None}
@@ -387,7 +387,7 @@ def _played(plan: Plan) -> Iterator[Reading]:
 
 
 def _recorded_grasps(paths: Sequence[Path], fingers: Sequence[str]) -> Iterator[TactileReading]:
-    """Yield grasps with an outcome. Raises `SceneError` or `RecordingError`."""
+    """Yield the grasps with outcomes of MCAP files. Raises `SceneError`, `RecordingError`."""
     from graspd.daemon.record.export import collect
 
     export = collect(paths)

@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the text."""
+    """Print the text that the command and its options choose; return 0."""
     match args.command:
         case "scene" if args.example is not None:
             text = explained.example(args.example)

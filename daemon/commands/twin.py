@@ -100,7 +100,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_faults(parser: argparse.ArgumentParser) -> None:
-    """Declare the faults, each by the name of its field in `LinkFaults`."""
+    """Declare options for the faults; they are parsed into the names of `LinkFaults`' fields."""
     faults = parser.add_argument_group("faults, none by default; chances are per frame")
     for name, text in PROBABILITIES.items():
         faults.add_argument(
@@ -157,7 +157,7 @@ def _add_faults(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Serve until stopped or until the recording ends; prints the faults injected, as JSON."""
+    """Serve until stopped or the recording ends; print the injected faults as JSON. 2: an error."""
     stop = threading.Event()
     former = {number: signal.signal(number, lambda *_: stop.set()) for number in stopping()}
     try:

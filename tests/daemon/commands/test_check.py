@@ -75,7 +75,7 @@ def test_check_finds_a_can_bus_that_can_never_open(keys: str, says: str, tmp_pat
 
 
 def checked(folder: Path, text: str) -> dict[str, Any]:
-    """What `graspd check` tells programs of a scene that is right."""
+    """The JSON document that `graspd check` prints on a right scene with this text."""
     result = graspd("check", written(folder, text), "--json")
     assert result.returncode == 0, result.stderr
     document: dict[str, Any] = json.loads(result.stdout)
@@ -142,7 +142,7 @@ def test_check_warns_of_udp_that_anybody_can_send_to(
         ('driver = "can"\ninterface = "virtual"\nchannel = "can77"\n', None),
     ],
 )
-def test_check_says_that_a_port_is_not_there_yet(
+def test_check_warns_of_a_missing_port_or_can_interface(
     tmp_path: Path, tactile: str, absent: str | None
 ) -> None:
     (tmp_path / "there").touch()

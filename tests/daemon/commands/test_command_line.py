@@ -66,7 +66,9 @@ for words in {names!r}:
         (["check", LOOP], "record"),
     ],
 )
-def test_a_command_without_its_extra_says_how_to_have_it(arguments: list[str], extra: str) -> None:
+def test_a_command_without_its_extra_says_how_to_install_it(
+    arguments: list[str], extra: str
+) -> None:
     code = f"{CORE_ONLY}\nsys.exit(main({arguments!r}))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 2
@@ -98,7 +100,7 @@ def test_every_argument_of_every_command_has_help() -> None:
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
-def test_what_is_mistyped_is_answered_with_the_nearest(arguments: list[str], meant: str) -> None:
+def test_a_mistyped_word_is_refused_with_the_nearest_one(arguments: list[str], meant: str) -> None:
     done = graspd(*arguments)
     assert done.returncode == 2
     assert done.stderr.endswith(f"; did you mean {meant}?\n")
@@ -121,7 +123,7 @@ def test_options_and_files_come_in_any_order(files_first: str, mixed: str) -> No
     assert whole_parser().parse_args(mixed.split()) == expected
 
 
-def test_the_version_tells_what_graspd_stands_on() -> None:
+def test_the_version_option_prints_python_and_library_versions_too() -> None:
     first, second = graspd("--version").stdout.splitlines()
     assert re.fullmatch(rf"graspd {re.escape(version('graspd'))}( at \S+)?", first)
     told = dict(part.rsplit(" ", 1) for part in second.split(", "))
@@ -131,7 +133,7 @@ def test_the_version_tells_what_graspd_stands_on() -> None:
 
 
 def on_a_terminal(setting: dict[str, str], *arguments: str) -> bytes:
-    """What a command writes there, with these variables in its environment."""
+    """What a command with these environment variables writes to a terminal."""
     own, terminal = os.openpty()
     environment = {**os.environ, "TERM": "xterm", "NO_COLOR": "", **setting}
     with subprocess.Popen(
@@ -150,7 +152,7 @@ def on_a_terminal(setting: dict[str, str], *arguments: str) -> bytes:
 @pytest.mark.parametrize(
     ("setting", "is_coloured"), [({}, True), ({"NO_COLOR": "1"}, False), ({"TERM": "dumb"}, False)]
 )
-def test_verdicts_are_coloured_on_a_terminal_that_wants_it(
+def test_verdicts_are_coloured_on_a_terminal_unless_switched_off(
     setting: dict[str, str], is_coloured: bool
 ) -> None:
     text = on_a_terminal(setting, "replay", "--verbose")
@@ -159,7 +161,7 @@ def test_verdicts_are_coloured_on_a_terminal_that_wants_it(
 
 
 @pytest.mark.skipif(sys.version_info[:2] != (3, 11), reason="argparse says usage otherwise")
-def test_the_page_is_that_of_these_commands(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_kept_manual_page_matches_the_parsers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     assert PAGE.read_text() == manual(), "run: python -m tests.daemon.commands.shell_files"
 

@@ -69,7 +69,7 @@ def test_run_names_the_process_that_has_the_port(
 
 
 def loop_scene(folder: Path) -> Path:
-    """The scene to try the whole loop with, and all that it makes, in this folder."""
+    """A copy of deploy/clients/loop.toml that makes all its files in this folder."""
     pytest.importorskip("mcap", reason="needs the extra `record`")
     text = (DEPLOY / "clients/loop.toml").read_text().replace("/tmp/graspd-", f"{folder}/")
     scene = folder / "loop.toml"
@@ -78,7 +78,9 @@ def loop_scene(folder: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_the_whole_loop_asks_tells_learns_and_records(tmp_path: Path) -> None:
+def test_the_example_controller_reports_outcomes_that_are_learned_and_recorded(
+    tmp_path: Path,
+) -> None:
     scene = loop_scene(tmp_path)
     code = (DEPLOY / "clients/python/try_outcomes.py").read_text()
     assert "/tmp/graspd-loop.ipc" in code

@@ -26,7 +26,7 @@ class QuietHandler(http.server.SimpleHTTPRequestHandler):
 
 @pytest.fixture
 def mirror(tmp_path: Path) -> Iterator[tuple[Path, str]]:
-    """A folder served over HTTP on the loopback address."""
+    """A folder, and the loopback address at which it is served over HTTP."""
     folder = tmp_path / "mirror"
     folder.mkdir()
     handler = functools.partial(QuietHandler, directory=str(folder))
@@ -94,7 +94,7 @@ ANSWERS = {
 
 
 @pytest.mark.parametrize("kind", ANSWERS)
-def test_a_malformed_answer_is_reported_in_one_line(tmp_path: Path, kind: str) -> None:
+def test_a_malformed_server_answer_is_reported_in_one_line(tmp_path: Path, kind: str) -> None:
     with served(lambda client: client.sendall(ANSWERS[kind])) as address:
         result = graspd("data", "--to", tmp_path / "data", "--url", address)
     assert result.returncode == 1
@@ -107,7 +107,7 @@ def test_a_malformed_answer_is_reported_in_one_line(tmp_path: Path, kind: str) -
     "address",
     ["http://a b", "http://[::1", "http://127.0.0.1:port", "http://\udcff"],
 )
-def test_an_address_that_is_none_is_one_line(tmp_path: Path, address: str) -> None:
+def test_an_invalid_address_is_refused_in_one_line(tmp_path: Path, address: str) -> None:
     result = graspd("data", "--to", tmp_path, "--url", address)
     assert result.returncode == 1
     (line,) = result.stderr.splitlines()
@@ -115,7 +115,7 @@ def test_an_address_that_is_none_is_one_line(tmp_path: Path, address: str) -> No
 
 
 @pytest.mark.parametrize("kind", ["fifo", "folder"])
-def test_other_things_than_files_are_not_replaced(tmp_path: Path, kind: str) -> None:
+def test_a_fifo_or_folder_at_the_target_is_not_replaced(tmp_path: Path, kind: str) -> None:
     target = tmp_path / f"{TABLES[0].name}.csv"
     if kind == "fifo":
         os.mkfifo(target)

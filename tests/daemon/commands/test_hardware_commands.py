@@ -44,7 +44,7 @@ PORT = free_port(socket.SOCK_DGRAM)
 
 
 def filled(text: str, folder: Path) -> str:
-    """Return a text of `SCENES` or `TWINS` with this test's own places."""
+    """Return a text of `SCENES` or `TWINS` with its folder, port, bus and CAN id filled in."""
     return text.format(folder=folder, port=PORT, group=GROUP, id=can_id(GROUP))
 
 
@@ -70,7 +70,7 @@ def end(process: subprocess.Popen[str]) -> str:
 
 
 def heard(folder: Path, wanted: int) -> list[Tactile]:
-    """Readings that the daemon publishes, up to `wanted` sound ones: a stall loses sweeps."""
+    """The first `wanted` published readings without faults; fewer if they cease to come."""
     found: list[Tactile] = []
     with Subscriber(f"ipc://{folder}/graspd", topics=("tactile.",)) as subscriber:
         while len(found) < wanted and (message := subscriber.take(TIMEOUT_S)) is not None:
@@ -87,7 +87,7 @@ def published(folder: Path, wanted: int) -> list[Verdict]:
 
 
 @pytest.mark.parametrize("kind", TWINS)
-def test_a_recording_on_the_wire_reads_as_its_replay(tmp_path: Path, kind: str) -> None:
+def test_a_recording_sent_by_a_twin_is_published_unchanged(tmp_path: Path, kind: str) -> None:
     with start("run", scene_for(kind, tmp_path)) as daemon:
         wait_for(tmp_path / "graspd")
         with twin(kind, tmp_path, "--recording", str(DEMO_TABLE), "--loop") as hardware:
@@ -118,7 +118,7 @@ def test_a_bridge_that_goes_away_gives_unknown_and_comes_back(tmp_path: Path) ->
         end(daemon)
 
 
-def test_the_doctor_finds_what_the_twin_broke(tmp_path: Path) -> None:
+def test_the_doctor_finds_the_faults_that_a_twin_simulates(tmp_path: Path) -> None:
     scene = scene_for("spi", tmp_path)
     with twin("spi", tmp_path, "--dead", "th_24", "--unplugged", "mf") as hardware:
         people = graspd("doctor", scene, "--listen", 2)

@@ -15,7 +15,7 @@ from tests.kit.scenes import demo_scene
 
 @pytest.fixture
 def own(tmp_path: Path) -> Path:
-    """A model without a card."""
+    """A copy of the model `mlp` without its card."""
     return Path(shutil.copy(zoo.find("mlp"), tmp_path / "mine.onnx"))
 
 
@@ -44,7 +44,9 @@ def test_a_file_that_the_daemon_would_refuse_is_not_shown(own: Path) -> None:
 
 
 @pytest.mark.parametrize("command", ["check", "run"])
-def test_a_change_of_an_own_model_is_refused(command: str, own: Path, tmp_path: Path) -> None:
+def test_a_users_model_that_changed_after_first_use_is_refused(
+    command: str, own: Path, tmp_path: Path
+) -> None:
     scene = demo_scene(tmp_path, sections=f'[model]\npath = "{own}"')
     first = graspd(command, scene)
     assert first.returncode == 0, first.stderr

@@ -1,6 +1,6 @@
-"""All commands, by a user without rights, with paths that are of no use: none ends in a traceback.
+"""All commands, by a user without rights, with unusable paths: none ends in a traceback.
 
-`python -m tests.daemon.commands.test_places FOLDER PLACE` walks the commands.
+`python -m tests.daemon.commands.test_places FOLDER PLACE` runs all, in FOLDER, with one such path.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from tests.kit.inside import graspd
 
 WITHOUT_RIGHTS = ("setpriv", "--bounding-set=-all", "--inh-caps=-all")
-"""Root without these is a user like any other, who owns the files of root."""
+"""Words that run a command without root's privileges, as a user who owns root's files."""
 PLACES = ("missing", "shut/below", "folder", "/dev/null", "dangling", "loop")
 DEMO = f'[tactile]\ndriver = "replay"\npace = "fast"\nrecordings = ["{DEMO_TABLE}"]\n'
 PALM = '[tactile]\ndriver = "palm"\nsource = "udp://127.0.0.1:0"\n'
@@ -32,7 +32,7 @@ FILES = (
     f'{DEMO}[curve]\nsecret_key = "d.key_secret"\nclients = "PLACE"\n',
     f'{PALM}[joints]\ndriver = "palm"\ncalibration = "PLACE"\n',
 )
-"""Scenes that name one path. They end by themselves."""
+"""Scenes that name one unusable path, `PLACE`. `graspd run` ends on them by itself."""
 PORTS = (
     '[tactile]\ndriver = "spi"\nport = "PLACE"\n',
     '[tactile]\ndriver = "can"\ninterface = "slcan"\nchannel = "PLACE"\n',
@@ -71,7 +71,7 @@ COMMANDS = (
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("place", PLACES)
-def test_no_command_ends_in_a_traceback(tmp_path: Path, place: str) -> None:
+def test_no_command_ends_in_a_traceback_on_unusable_paths(tmp_path: Path, place: str) -> None:
     can_lose = os.geteuid() == 0 and shutil.which(WITHOUT_RIGHTS[0])
     before = WITHOUT_RIGHTS if can_lose else ()
     walk = (sys.executable, "-m", "tests.daemon.commands.test_places", str(tmp_path), place)
@@ -84,7 +84,7 @@ def test_no_command_ends_in_a_traceback(tmp_path: Path, place: str) -> None:
 
 
 def furnish(folder: Path) -> None:
-    """Make the places in `folder`."""
+    """Make the unusable paths of `PLACES` in `folder`."""
     (folder / "folder").mkdir()
     (folder / "shut").mkdir()
     (folder / "shut/below").touch()
@@ -94,14 +94,14 @@ def furnish(folder: Path) -> None:
 
 
 def run(line: str) -> None:
-    """Run a command; write how it ended."""
+    """Run a command of graspd; print it, its exit code and the start of its output."""
     sys.stdout.write(f"{line}: ")
     result = graspd(*line.split())
     sys.stdout.write(f"{result.returncode} {(result.stderr or result.stdout)[:200]!r}\n")
 
 
 def main(folder: Path, place: str) -> None:
-    """Run all commands with a place."""
+    """Run all commands in `folder`, with `place` as each path."""
     furnish(folder)
     os.chdir(folder)
     for command in COMMANDS:

@@ -87,7 +87,7 @@ def summary_of(*arguments: object) -> dict[str, Any]:
     return summary
 
 
-def test_outcomes_told_after_their_verdicts_teach() -> None:
+def test_outcomes_reported_in_a_replay_improve_the_verdicts() -> None:
     told, silent = summary_of(DEMO_DAY, "--outcomes"), summary_of(DEMO_DAY)
     assert silent["outcomes"] == 0
     assert told["outcomes"] == 300 - told["reasons"].get("never-seen", 0)
@@ -95,14 +95,14 @@ def test_outcomes_told_after_their_verdicts_teach() -> None:
     assert told["stable"]["slips_among_stable"] < 0.6 * silent["stable"]["slips_among_stable"]
 
 
-def test_a_verdict_is_told_before_its_outcome_is() -> None:
+def test_a_replay_prints_each_verdict_before_learning_its_outcome() -> None:
     result = graspd("replay", DEMO_DAY, "--outcomes", "--json")
     outcomes = [json.loads(line)["outcomes"] for line in result.stdout.splitlines()]
     assert outcomes[:2] == [0, 1]
     assert {later - former for former, later in pairwise(outcomes)} == {0, 1}  # 0: never seen
 
 
-def test_a_risk_is_kept_on_a_table_and_reported() -> None:
+def test_a_replayed_table_keeps_the_risk_limit_and_reports_it() -> None:
     risk = ("--outcomes", "--max-slip-when-stable", "0.05")
     every, lifted = summary_of(DEMO_DAY, *risk), summary_of(DEMO_DAY, *risk, "--only-lifted")
     silent = summary_of(DEMO_DAY)
@@ -122,7 +122,7 @@ def test_a_risk_is_kept_on_a_table_and_reported() -> None:
     assert bare["reasons"].get("unproven") is None
 
 
-def test_a_streams_outcome_is_told_once_after_its_grasp() -> None:
+def test_a_streams_outcome_is_reported_once_after_its_grasp() -> None:
     result = graspd("replay", DEMO_RECORDING, "--outcomes", "--json")
     verdicts = [decode_verdict(line.encode()) for line in result.stdout.splitlines()]
     summary = json.loads(result.stderr)
@@ -133,7 +133,7 @@ def test_a_streams_outcome_is_told_once_after_its_grasp() -> None:
         assert len({v.outcomes for v in verdicts if v.grasp == grasp and v.judged}) == 1
 
 
-def test_a_renamed_part_of_a_training_table_is_known(bts3_dir: Path, tmp_path: Path) -> None:
+def test_a_renamed_part_of_a_training_table_is_recognised(bts3_dir: Path, tmp_path: Path) -> None:
     table = tmp_path / "friday.csv"
     lines = (bts3_dir / "palm_45.csv").read_text().splitlines(keepends=True)
     table.write_text("".join([lines[0], *lines[-40:]]))

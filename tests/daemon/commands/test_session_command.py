@@ -46,7 +46,7 @@ def test_a_session_is_seeded_shown_used_and_forgotten(scene: Path, bts3_dir: Pat
 
 
 @pytest.mark.parametrize("section", ["", '[session]\nkeep = false\nfolder = "kept"\n'])
-def test_a_scene_that_keeps_no_session_touches_none(section: str, tmp_path: Path) -> None:
+def test_seed_and_reset_refuse_scenes_that_keep_no_session(section: str, tmp_path: Path) -> None:
     path = demo_scene(tmp_path, sections=section)
     for refused in (graspd("session", "seed", path, DEMO_TABLE), graspd("session", "reset", path)):
         assert refused.returncode == 2
@@ -54,8 +54,8 @@ def test_a_scene_that_keeps_no_session_touches_none(section: str, tmp_path: Path
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_session_of_no_use_is_not_shown_as_calibrated(tmp_path: Path) -> None:
-    """One that is of other fingers, and one whose electrodes all rest where no grasp is."""
+def test_an_unusable_session_is_not_shown_as_calibrated(tmp_path: Path) -> None:
+    """A session of other fingers, and one with mean counts that no grasp has."""
     path = session_scene(tmp_path)
     shown = []
     for fingers in (("ff", "mf", "rf"), ("ff", "mf", "th")):
@@ -85,7 +85,7 @@ def test_garbage_seeds_no_session(scene: Path, tmp_path: Path) -> None:
     assert graspd("session", "show", scene).stdout.count("no session is kept") == 1
 
 
-def test_a_broken_session_file_is_one_line_in_a_replay(tmp_path: Path) -> None:
+def test_replay_refuses_a_session_of_other_size_in_one_line(tmp_path: Path) -> None:
     with SessionFolder(tmp_path) as folder:
         odd = SessionState(1.0, 1, (1.0,) * 10, (1.0,) * 10)
         folder.save([KeptSession(odd, ("ff", "mf", "th"), {})])
@@ -94,7 +94,7 @@ def test_a_broken_session_file_is_one_line_in_a_replay(tmp_path: Path) -> None:
     assert result.stderr == "graspd: the kept session is of 10 values, not of 150\n"
 
 
-def test_a_model_that_learns_nothing_says_so(tmp_path: Path) -> None:
+def test_session_show_refuses_a_model_that_keeps_no_session(tmp_path: Path) -> None:
     path = session_scene(tmp_path, "cnn1", "[learn]\nenabled = false\n")
     result = graspd("session", "show", path)
     assert result.returncode == 2

@@ -33,7 +33,7 @@ ROWS = list(read_rows(DEMO_TABLE, FINGERS))
 
 
 def seed(path: Path, recording: Path) -> TrustState | None:
-    """What is kept after seeding."""
+    """Seed the session from a recording; return what it has learned (None: nothing)."""
     seeded = graspd("session", "seed", path, recording)
     assert seeded.returncode == 0, seeded.stderr
     kept = last_kept(path.with_name("right"))
@@ -49,14 +49,14 @@ def shown(path: Path) -> dict[str, Any]:
 
 
 def live_trust(path: Path) -> Trust:
-    """That of a daemon which starts now."""
+    """The trust of a daemon that starts with this scene, with nothing learned yet."""
     wanted = scenes.load(path)
     trust = assembly.build_pipeline(Plan.of(wanted), assembly.load_model(wanted)).trust
     assert trust is not None
     return trust
 
 
-def test_a_table_teaches_but_counts_as_no_lift(tmp_path: Path) -> None:
+def test_seeding_from_a_table_teaches_but_counts_no_lifts(tmp_path: Path) -> None:
     path = session_scene(tmp_path, sections="[risk]\nmax_slip_when_stable = 0.1\n")
     learned = seed(path, DEMO_TABLE)
     assert learned is not None
@@ -73,8 +73,8 @@ def test_a_table_teaches_but_counts_as_no_lift(tmp_path: Path) -> None:
     assert (told["outcomes"], told["lifts"]) == (learned.learner.outcomes, 0)
 
 
-def test_a_seed_keeps_where_the_recorded_sensors_rest(tmp_path: Path) -> None:
-    """Twenty grasps that hold and slip in turn; their outcomes end the warm-up."""
+def test_seeding_from_a_stream_keeps_the_sensors_resting_counts(tmp_path: Path) -> None:
+    """Forty grasps hold and slip in turn; their outcomes end the warm-up."""
     counts = [row.counts for row in ROWS[:40]]
     ends = [EndPoint(each, bool(number % 2), "mug") for number, each in enumerate(counts)]
     rest = rest_above(np.array([row.counts for row in ROWS]))
@@ -109,7 +109,7 @@ def test_a_recording_teaches_as_the_table_of_its_grasps_does(tmp_path: Path) -> 
     assert seed(recorded, recording) == seed(table, DEMO_TABLE)
 
 
-def test_a_model_without_session_learns_from_outcomes_or_refuses(tmp_path: Path) -> None:
+def test_seeding_a_model_without_session_needs_known_outcomes(tmp_path: Path) -> None:
     path = session_scene(tmp_path, model="mlp")
     refused = graspd("session", "seed", path, unlabelled_demo(tmp_path))
     assert refused.returncode == 2
@@ -122,7 +122,7 @@ def test_a_model_without_session_learns_from_outcomes_or_refuses(tmp_path: Path)
     assert document["calibrated"] is False
 
 
-def test_seeding_where_nothing_learns_keeps_what_was_learned(tmp_path: Path) -> None:
+def test_seeding_with_learning_off_keeps_what_was_learned(tmp_path: Path) -> None:
     learned = seed(session_scene(tmp_path), DEMO_TABLE)
     assert learned is not None
     assert learned.learner.outcomes > 0
@@ -130,7 +130,7 @@ def test_seeding_where_nothing_learns_keeps_what_was_learned(tmp_path: Path) -> 
     assert seed(off, unlabelled_demo(tmp_path)) == learned
 
 
-def test_seeding_and_forgetting_leave_nothing_of_before(tmp_path: Path) -> None:
+def test_reset_forgets_a_session_unless_another_graspd_uses_it(tmp_path: Path) -> None:
     path, kept = session_scene(tmp_path), tmp_path / "right"
     seed(path, DEMO_TABLE)
     with SessionFolder(kept) as folder:
@@ -148,8 +148,8 @@ def test_seeding_and_forgetting_leave_nothing_of_before(tmp_path: Path) -> None:
     assert shown(path)["session"] is None
 
 
-def test_a_person_settles_announced_lifts(tmp_path: Path) -> None:
-    """They settle as their controller would have told them, by the same rule."""
+def test_settling_announced_lifts_learns_as_if_their_controller_reported(tmp_path: Path) -> None:
+    """`session settle` has the effect that the outcomes have if a controller reports them."""
     sections = "keep = true\n[risk]\nmax_slip_when_stable = 0.1\n"
     path, kept = session_scene(tmp_path, "mlp", sections), tmp_path / "right"
     trust, boot = live_trust(path), "0123456789abcdef" * 2
@@ -182,8 +182,8 @@ def test_a_person_settles_announced_lifts(tmp_path: Path) -> None:
     assert {each.name: each.read_bytes() for each in kept.iterdir()} == files
 
 
-def test_settling_leaves_the_last_session_the_last(tmp_path: Path) -> None:
-    """Of two lifts one is open in the files of two sets of sensors; another model ran last."""
+def test_settling_lifts_keeps_the_order_of_the_session_files(tmp_path: Path) -> None:
+    """The files of two sets of sensors have the same lift open; another model ran last."""
     path = session_scene(tmp_path, "mlp", "keep = true\n[risk]\nmax_slip_when_stable = 0.1\n")
     kept, trust = tmp_path / "right", live_trust(path)
     told, grasp = (GraspId("0123456789abcdef" * 2, number) for number in (1, 2))
@@ -206,8 +206,8 @@ def test_settling_leaves_the_last_session_the_last(tmp_path: Path) -> None:
     assert "0 lifts without" in graspd("session", "settle", path).stdout
 
 
-def test_a_session_is_shown_as_a_start_continues_it(tmp_path: Path) -> None:
-    """A model that needs no statistics ran last with the same sensors."""
+def test_session_show_lists_first_the_session_a_start_continues(tmp_path: Path) -> None:
+    """A model that keeps no statistics ran last, with the same sensors."""
     path = session_scene(tmp_path)
     learned = seed(path, DEMO_TABLE)
     seeded = last_kept(tmp_path / "right")
@@ -225,7 +225,7 @@ def test_a_session_is_shown_as_a_start_continues_it(tmp_path: Path) -> None:
     assert [each["file"] for each in document["others"]] == ["3.session"]
 
 
-def test_what_is_damaged_is_said(tmp_path: Path) -> None:
+def test_show_seed_and_settle_name_a_damaged_session_file(tmp_path: Path) -> None:
     path, kept = session_scene(tmp_path, model="mlp"), tmp_path / "right" / "1.session"
     kept.parent.mkdir()
     kept.write_bytes(b"?")
