@@ -20,7 +20,7 @@ LISTENING = {"tcp": {"0A"}, "udp": {"01", "07"}}
 TERMINAL_MAKER = "/dev/ptmx"
 IP_TIMEOUT_S = 5.0
 COMMAND_MAX = 400
-"""Most characters that are shown of a command."""
+"""Most characters that are shown of a process's command line."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +31,7 @@ class SerialPort:
     description: str
     serial_number: str | None
     vendor: int | None
-    """USB vendor; None: not on USB."""
+    """USB vendor id; None: not on USB."""
     product: str
     """Names of product and manufacturer, as the device reports them."""
 
@@ -57,7 +57,7 @@ class CanInterface:
 
     @property
     def is_down(self) -> bool:
-        """True if it carries no frames."""
+        """True if the interface is down or its controller stopped."""
         return self.state in ("down", "stopped")
 
     @property
@@ -68,7 +68,7 @@ class CanInterface:
 
 @dataclass(frozen=True, slots=True)
 class Process:
-    """Another process."""
+    """Another process of this computer, with its command line."""
 
     pid: int
     command: str
@@ -78,7 +78,7 @@ class Process:
 
     @property
     def is_graspd(self) -> bool:
-        """True if it is one of graspd's commands."""
+        """True if the process runs one of graspd's commands."""
         words = self.command.split()
         return "-m graspd" in self.command or any(Path(word).name == "graspd" for word in words[:3])
 
@@ -102,7 +102,7 @@ def serial_ports() -> list[SerialPort]:
 def can_interfaces(
     folder: Path = NETWORK, ip: Sequence[str] = ("ip", "-json", "-details", "link")
 ) -> list[CanInterface]:
-    """Return the CAN interfaces in `/sys/class/net`, with the controller's state from `ip`."""
+    """Return the CAN interfaces in `folder`, with state and bit rate from the command `ip`."""
     states = {}
     for interface in sorted(folder.glob("*")):
         with suppress(OSError):
@@ -159,7 +159,7 @@ def file_holders(path: str | Path) -> list[Process]:
 
 
 def port_holders(protocol: str, port: int) -> list[Process]:
-    """Return other processes that listen on a `udp` or `tcp` port, if /proc may be read."""
+    """Return other processes that listen on a `udp` or `tcp` port; empty if /proc is unreadable."""
     inodes = set()
     for table in (protocol, f"{protocol}6"):
         with suppress(OSError):

@@ -19,13 +19,13 @@ QUIET_COUNTS = 40.0
 TOUCH_ELECTRODES = 5
 """Fewest electrodes of a finger that a touch moves. If fewer move, they are restless."""
 STILL_READINGS = 10
-"""Equal counts in a row after which an electrode is frozen; noise of 3 counts prevents that."""
+"""Fewest readings, all with equal counts, to call an electrode frozen; noise is about 3 counts."""
 RESTLESS_READINGS = 30
 """Fewest readings to call an electrode restless. With fewer, one spike would be enough."""
 FAULTY_FRACTION = 0.5
-"""Share of faulty readings from which on an electrode counts as missing, not as unreliable."""
+"""Share of faulty readings above which an electrode counts as missing, not as unreliable."""
 NAMED_MAX = 6
-"""Most electrodes that are named in a finding; further ones are counted."""
+"""Most electrodes that a finding names; of more it says only how many they are."""
 WORDS = ElectrodeFault.PARITY | ElectrodeFault.ERROR_WORD | ElectrodeFault.NOT_A_COUNT
 DEAD = Trouble(
     Cause.ELECTRODE_DEAD,
@@ -92,12 +92,13 @@ class ElectrodeStatistics:
 
     @property
     def deviation(self) -> NDArray[np.float64]:
-        """Standard deviation, counts, shape (fingers, 24)."""
+        """Standard deviation over readings without a fault, counts, shape (fingers, 24)."""
         return np.sqrt(self._squares / np.maximum(self._sound, 1), dtype=np.float64)
 
     @property
     def noise(self) -> NDArray[np.float64]:
-        """Standard deviation between readings, counts; a slow touch does not raise it."""
+        """Standard deviation by steps from one reading to the next, counts, shape (fingers, 24); a
+        slow touch does not raise it."""
         variance = self._step_squares / np.maximum(self._steps, 1) / 2.0
         return np.sqrt(variance, dtype=np.float64)
 
@@ -178,7 +179,7 @@ def _in_words(bits: ElectrodeFault) -> str:
 
 
 def _names(finger: str, which: Mask) -> str:
-    """Name up to six electrodes, such as `ff_7`, or count them."""
+    """Return the names of up to six electrodes, such as `ff_7`, or the number of more."""
     numbers = np.flatnonzero(which) + 1
     if len(numbers) > NAMED_MAX:
         return f"{finger}: {len(numbers)} electrodes"

@@ -101,7 +101,7 @@ EXPLAINS: dict[Cause | None, frozenset[Cause]] = {
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """A finding with level `OK` has no cause and no advice; any other has both."""
+    """Text on `what` was found, and how bad it is. Level `OK` has no cause and advice, others do."""
 
     level: Level
     what: str
@@ -110,7 +110,7 @@ class Finding:
 
 
 class Trouble(NamedTuple):
-    """A cause, and what to do about it."""
+    """Cause, advice and level that all findings on one fault share."""
 
     cause: Cause
     advice: str

@@ -14,13 +14,13 @@ TOO_MUCH = {Cause.DAMAGED: 0.05, Cause.FRAMES_LOST: 0.1}
 """Share of frames from which on damage or loss is an error. Each loss hides motion for 240 ms, so
 with a tenth of 100 readings/s lost, hardly any grasp is ever known to be still."""
 BAD_MIN = 5
-"""Fewest bad frames by which their share is known."""
+"""Fewest bad frames that are an error by their share."""
 WHOLES = "frames", "packets", "readings"
-"""Counters of everything that arrives; each kind of link has one of them."""
+"""Counters of all that arrives; shares are of the first that is not 0."""
 NOT_FRAMES = frozenset(
     {"not_counts", "missed_readings", "cut_sweeps", "interrupted_sweeps", "interrupted_rounds"}
 )
-"""Counters of values, of which a frame has many, and of readings, which may take many frames."""
+"""Counters that are not of frames: of values, many in a frame, and of readings in many frames."""
 JOINING = frozenset({"unsynchronised_frames", "unsynchronised_packets"})
 JOINING_MAX = 108
 """Most samples in `JOINING` that are harmless: a listener in mid-sweep loses up to two of 54."""
@@ -229,7 +229,7 @@ def counter_findings(driver: str, counters: Mapping[str, int]) -> list[Finding]:
 
 
 def rate_finding(driver: str, readings: int, seconds: float, period_ns: int | None) -> Finding:
-    """Judge whether readings come at their nominal rate."""
+    """Return a finding on the readings' rate in `seconds`; `period_ns`: nominal; None: unknown."""
     rate_hz = readings / seconds
     if not readings:
         what = f"{driver}: no reading in {seconds:.1f} s"
@@ -245,7 +245,7 @@ def rate_finding(driver: str, readings: int, seconds: float, period_ns: int | No
 
 
 def _is_too_much(cause: Cause, counters: Mapping[str, int]) -> bool:
-    """Return True for `FLAPS_MIN` losses of a link, and for a share of bad frames in `TOO_MUCH`."""
+    """Return True if the counters of `cause` are an error, by `FLAPS_MIN` or `TOO_MUCH`."""
     if cause is Cause.LINK_LOST:
         return counters["link_losses"] >= FLAPS_MIN
     share = TOO_MUCH.get(cause)
@@ -263,7 +263,7 @@ def _is_too_much(cause: Cause, counters: Mapping[str, int]) -> bool:
 
 
 def _counted(names: Sequence[str], counters: Mapping[str, int]) -> str:
-    """Name the counters that are not 0, such as `2 bad crc, 1 too long`."""
+    """Return the counters above what is harmless as text, such as `2 bad crc, 1 too long`."""
     return ", ".join(
         f"{count} {name.replace('_', ' ')}"
         for name in names

@@ -58,7 +58,8 @@ def model_finding(wanted: Scene) -> Finding:
 
 
 def explained(finding: Finding, section: DriverSection) -> list[Finding]:
-    """Return a finding on the link of `section`, improved by what this computer shows."""
+    """Return the finding on the link of `section`, made exact by what this computer shows, such as
+    who holds the port, and maybe findings on other ports or interfaces."""
     device = section.device
     if device is None:
         return [finding]
@@ -85,7 +86,7 @@ def explained(finding: Finding, section: DriverSection) -> list[Finding]:
 
 
 def shared_findings(section: DriverSection) -> list[Finding]:
-    """Warn of another program that has the port open. `explained` says which."""
+    """Return a warning if another program has the port open. `explained` says which program."""
     device = section.device
     if device is None or device.kind is DeviceKind.UDP or not computer.file_holders(device.name):
         return []
@@ -105,7 +106,7 @@ def can_finding(interface: computer.CanInterface, tactile: CanTactile | None = N
 
 
 def ip_link(name: str, tactile: CanTactile | None) -> str:
-    """Return the command that brings a CAN interface up with the bit rate of a scene."""
+    """Return the command that brings a CAN interface up at the scene's bit rate, else `BITRATE`."""
     bitrate = BITRATE if tactile is None or tactile.bitrate is None else tactile.bitrate
     return f"sudo ip link set {name} up type can bitrate {bitrate} restart-ms 100"
 
@@ -130,7 +131,7 @@ def socket_findings(wanted: Scene) -> list[Finding]:
 
 
 def key_findings(wanted: Scene) -> list[Finding]:
-    """Judge the keys of `[curve]`."""
+    """Return an error for each wrong key of `[curve]`; empty if all are right or none are used."""
     if wanted.curve is None:
         return []
     from graspd.daemon.publish import keys  # only where there are any
@@ -222,7 +223,7 @@ def _of_socket(name: str, path: Path) -> Iterator[Finding]:
 
 
 def _is_reached(path: Path) -> bool:
-    """Return False if a folder on the way may not be entered."""
+    """Return False if a folder on the way to `path` may not be entered; True if one is missing."""
     try:
         path.stat()
     except OSError as error:  # a missing path is another finding

@@ -41,7 +41,7 @@ LOOPBACK = "udp://127.0.0.1:0"
 
 
 class Hand:
-    """What the sensors feel: whole grasps, without end."""
+    """Counts of whole synthetic grasps, without end, for a twin to send."""
 
     def __init__(self, rate_hz: float) -> None:
         self._counts = (moment.counts for moment in synthetic_grasps(rate_hz=rate_hz, loop=True))
@@ -50,12 +50,12 @@ class Hand:
         return self._counts
 
     def skip(self, moments: int) -> None:
-        """Let this time pass without a listener."""
+        """Leave out this number of moments."""
         next(itertools.islice(self._counts, moments, moments), None)
 
 
 Step = Callable[[], None]
-"""One period of a link passes: its clock moves, and the twin sends."""
+"""Let one period of a link pass: move its clock, and let the twin send."""
 Link = contextlib.AbstractContextManager[tuple[Driver, Step]]
 
 
@@ -101,7 +101,7 @@ def can(hand: Hand, _folder: Path, faults: LinkFaults) -> Iterator[tuple[Driver,
 def _udp(
     twin: DatagramTwin, driver: PalmDriver | JointStreamDriver | TactileStreamDriver, clock: Clock
 ) -> Iterator[tuple[Driver, Step]]:
-    """What a twin sends over UDP, at its own pace."""
+    """A driver that gets a twin's datagrams over UDP; each step sends those of one period."""
     cycles = twin.cycles()
     with driver, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
 
@@ -114,19 +114,19 @@ def _udp(
 
 
 def palm(hand: Hand, _folder: Path, faults: LinkFaults) -> Link:
-    """Packets, one a millisecond."""
+    """Packets of a palm over UDP, one a millisecond."""
     clock = Clock()
     return _udp(PalmTwin(hand, faults=faults), PalmDriver(LOOPBACK, clock=clock), clock)
 
 
 def datagrams(hand: Hand, _folder: Path, faults: LinkFaults) -> Link:
-    """Counts as JSON, at 100 Hz."""
+    """Counts as JSON over UDP, at 100 Hz."""
     clock = Clock()
     return _udp(TactileTwin(hand, faults=faults), TactileStreamDriver(LOOPBACK, clock=clock), clock)
 
 
 def joints(_hand: Hand, _folder: Path, faults: LinkFaults) -> Link:
-    """Joint angles, at 100 Hz."""
+    """Joint angles over UDP, at 100 Hz."""
     clock = Clock()
     return _udp(JointTwin(faults), JointStreamDriver(LOOPBACK, clock=clock), clock)
 
@@ -142,7 +142,7 @@ STEPS_PER_S = {"spi": 100, "can": 100, "palm": 1000, "datagrams": 100, "joints":
 
 
 def listen(driver: Driver, step: Step, steps: int, statistics: ElectrodeStatistics) -> None:
-    """Let periods of the link pass, and take in what comes."""
+    """Let `steps` periods of the link pass; add the tactile readings to `statistics`."""
     for _ in range(steps):
         step()
         for reading in driver.read_ready():
@@ -151,7 +151,7 @@ def listen(driver: Driver, step: Step, steps: int, statistics: ElectrodeStatisti
 
 
 def faults_told(driver: Driver, statistics: ElectrodeStatistics, seconds: float) -> list[Finding]:
-    """What the doctor says after that is wrong."""
+    """Findings of the doctor that are not `OK`, after it listened for `seconds`."""
     felt = None if driver.name == JointStreamDriver.name else statistics
     told = examine(driver, felt, seconds)
     return [finding for finding in told if finding.level is not Level.OK]
@@ -169,7 +169,7 @@ def refused(number: int) -> Callable[..., object]:
 
 
 def scene_of(folder: Path, text: str) -> Path:
-    """A scene with a model and a socket, if the text does not have its own."""
+    """Write a scene of `text`, with a model and a socket if it has none; return its path."""
     if "[model]" not in text:
         text += '[model]\nname = "cnn1"\n'
     if "[publish]" not in text:
@@ -178,12 +178,12 @@ def scene_of(folder: Path, text: str) -> Path:
 
 
 def asked(folder: Path, text: str, *options: str) -> CompletedProcess[str]:
-    """What a doctor says that listens for a moment."""
+    """Run `graspd doctor` for 0.6 s on a scene of `text`."""
     return graspd("doctor", scene_of(folder, text), "--listen", 0.6, *options)
 
 
 def look(folder: Path, text: str) -> list[dict[str, str]]:
-    """Return the doctor's findings without `slow`: a busy computer slows the twin."""
+    """Return the doctor's findings that are not ok, nor `slow`: a busy computer slows the twin."""
     result = asked(folder, text, "--json")
     told = [f for f in json.loads(result.stdout)["findings"] if f["level"] != "ok"]
     assert result.returncode == int("error" in {finding["level"] for finding in told})

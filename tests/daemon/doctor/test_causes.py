@@ -1,4 +1,4 @@
-"""Whatever is wrong is told by the name of its cause, with advice, and nothing else is accused."""
+"""The doctor reports each fault by the name of its cause, with advice, and nothing else."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from tests.ports import free_port
 
 @pytest.fixture
 def healthy(tmp_path: Path) -> Iterator[str]:
-    """`[tactile]` of a bridge that sweeps, in real time."""
+    """Text of `[tactile]` for a simulated bridge without faults, which sends in real time."""
     counts, done = (moment.counts for moment in synthetic_grasps(loop=True)), threading.Event()
     with spi_twin.SpiTwin(tmp_path / "bridge", counts) as twin:
         thread = threading.Thread(target=twin.serve, args=(done.is_set,))
@@ -61,7 +61,7 @@ def healthy(tmp_path: Path) -> Iterator[str]:
         ("root", "Install deploy/udev/70-graspd.rules, and plug it in again."),
     ],
 )
-def test_a_port_that_is_denied_is_told_with_its_group(
+def test_a_denied_port_is_reported_with_advice_for_its_group(
     group: str, advice: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("serial.serial_for_url", refused(errno.EACCES))
@@ -72,7 +72,7 @@ def test_a_port_that_is_denied_is_told_with_its_group(
 
 @pytest.fixture
 def pid(monkeypatch: pytest.MonkeyPatch) -> int:
-    """This process, which the doctor takes for another one."""
+    """Id of this process, which the doctor then counts as another one."""
     number = os.getpid()
     monkeypatch.setattr("os.getpid", lambda: 1)
     return number
@@ -90,7 +90,7 @@ sys.stdin.read()
 
 @contextlib.contextmanager
 def holder(path: object, *locks: str) -> Iterator[int]:
-    """Another process that has a file open, or locked; its PID."""
+    """Id of another process that has a file open, and locked if any `locks` are given."""
     command = [sys.executable, "-c", HOLD, str(path), *locks]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
@@ -112,7 +112,7 @@ def test_a_held_port_is_reported_with_the_holders_pid(tmp_path: Path) -> None:
     assert told["advice"] == f"End it: kill {other}"
 
 
-def test_a_reader_without_a_lock_is_told_with_its_pid(tmp_path: Path, healthy: str) -> None:
+def test_another_reader_of_the_port_is_reported_with_its_pid(tmp_path: Path, healthy: str) -> None:
     found: list[dict[str, str]] = []
 
     def is_a_warning() -> bool:  # an error while a busy computer brings no readings
@@ -127,7 +127,7 @@ def test_a_reader_without_a_lock_is_told_with_its_pid(tmp_path: Path, healthy: s
     assert told["advice"] == f"End it: kill {other}"
 
 
-def test_a_port_that_graspd_itself_holds_is_told(tmp_path: Path, healthy: str) -> None:
+def test_a_port_that_graspd_itself_holds_is_reported(tmp_path: Path, healthy: str) -> None:
     scene = scene_of(tmp_path, healthy)
     with start("run", scene) as daemon:
         found: list[dict[str, str]] = []
@@ -169,7 +169,7 @@ def test_a_missing_interface_is_reported_with_the_present_ones(
         (("error-active", 1_000_000), "silent", "Check power and connection"),
     ],
 )
-def test_a_wrong_interface_is_reported_with_the_command(
+def test_a_silent_can_interface_is_explained_by_its_kernel_state(
     interface: tuple[str, int | None],
     cause: str,
     advice: str,
@@ -186,13 +186,13 @@ def test_a_wrong_interface_is_reported_with_the_command(
 
 
 @pytest.mark.parametrize("state", ["bus-off", "error-passive"])
-def test_a_controller_in_trouble_is_not_said_to_be_fine(state: str) -> None:
+def test_a_bus_off_or_error_passive_controller_is_a_warning(state: str) -> None:
     told = can_finding(computer.CanInterface("can0", state, 1_000_000))
     assert (told.level, told.cause) == (Level.WARNING, Cause.BUS_ERRORS)
     assert "sudo ip link set can0 down; sudo ip link set can0 up type can" in (told.advice or "")
 
 
-def test_a_board_that_sends_has_no_finding_of_bit_rate(
+def test_no_bit_rate_finding_while_a_can_board_sends(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     there = computer.CanInterface(LOOPBACK, "error-active", 500_000)
@@ -209,7 +209,7 @@ def test_a_board_that_sends_has_no_finding_of_bit_rate(
 @pytest.mark.parametrize(
     ("host", "cause"), [("127.0.0.1", "socket-held"), ("192.0.2.1", "address")]
 )
-def test_a_port_that_cannot_be_bound_is_reported(
+def test_a_tcp_endpoint_that_cannot_be_bound_is_reported(
     host: str, cause: str, tmp_path: Path, healthy: str, pid: int
 ) -> None:
     with socket.create_server(("127.0.0.1", 0)) as held:
@@ -257,7 +257,7 @@ SURROUNDINGS: dict[str, tuple[str, str, str]] = {
 
 
 @pytest.mark.parametrize("wrong", SURROUNDINGS)
-def test_each_fault_around_a_healthy_bridge_is_named(
+def test_each_fault_of_model_sockets_or_keys_is_reported(
     wrong: str, tmp_path: Path, healthy: str
 ) -> None:
     more, cause, advice = SURROUNDINGS[wrong]
@@ -267,7 +267,7 @@ def test_each_fault_around_a_healthy_bridge_is_named(
     assert advice.format(folder=tmp_path) in mine[0]["advice"]
 
 
-def test_a_socket_that_graspd_holds_is_told(tmp_path: Path, pid: int) -> None:
+def test_a_socket_held_by_another_process_is_reported(tmp_path: Path, pid: int) -> None:
     (tmp_path / "graspd.lock").touch()
     text = (
         f'[tactile]\ndriver = "palm"\nsource = "udp://127.0.0.1:{free_port(socket.SOCK_DGRAM)}"\n'
@@ -280,7 +280,7 @@ def test_a_socket_that_graspd_holds_is_told(tmp_path: Path, pid: int) -> None:
     assert f"PID {pid}, " in told[1]["what"]
 
 
-def test_rights_that_a_user_lacks_are_told(
+def test_rights_that_a_user_lacks_are_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, healthy: str
 ) -> None:
     monkeypatch.setattr("os.geteuid", lambda: 12345)
@@ -296,7 +296,7 @@ def test_rights_that_a_user_lacks_are_told(
     assert "LimitRTPRIO=40" in str(told)
 
 
-def test_the_table_of_electrodes_needs_all_and_fits(tmp_path: Path, healthy: str) -> None:
+def test_option_all_prints_electrodes_within_80_columns(tmp_path: Path, healthy: str) -> None:
     assert "mean, sd, faulty" not in asked(tmp_path, healthy).stdout
     _, table = asked(tmp_path, healthy, "--all").stdout.split("to look at\n\n")
     lines = table.splitlines()

@@ -46,7 +46,7 @@ HARMLESS = """
     joint_readings link_failures metadata_packets other_palms parity_words refused_bridges
     remote_frames repeats stale_sweeps unanswered_pings unknown_types unplugged_words
 """
-"""Counters of any driver without a finding: others, or the electrodes, show what they count."""
+"""Counters without a finding of their own: others, or the electrodes, show the fault."""
 Counts = NDArray[np.float64]
 Faults = NDArray[np.uint8]
 
@@ -54,7 +54,7 @@ Faults = NDArray[np.uint8]
 def statistics(
     spoil: Callable[[Counts, Faults, int], None], readings: int = 100
 ) -> ElectrodeStatistics:
-    """Statistics over untouched sensors with 3.5 counts of noise, spoilt by the test."""
+    """Statistics of untouched sensors with 3.5 counts of noise; `spoil` changes each reading."""
     random = np.random.default_rng(0)
     rest = random.uniform(2400, 3400, (3, 24))
     found = ElectrodeStatistics(FINGERS)
@@ -66,7 +66,7 @@ def statistics(
     return found
 
 
-def test_the_running_figures_are_those_of_numpy() -> None:
+def test_running_mean_and_deviation_are_those_of_numpy() -> None:
     kept: list[Counts] = []
 
     def keep(counts: Counts, faults: Faults, n: int) -> None:
@@ -152,14 +152,14 @@ def test_a_fault_of_electrodes_is_named_with_its_cause(
         (5, None, Level.OK),
     ],
 )
-def test_the_rate_is_judged_by_its_nominal(
+def test_a_low_rate_is_a_warning_and_silence_an_error(
     readings: int, period_ns: int | None, level: Level
 ) -> None:
     assert rate_finding("spi", readings, 3.0, period_ns).level is level
 
 
 @pytest.mark.parametrize(("number", "findings"), [(0, 0), (13, 0), (108, 0), (109, 1)])
-def test_joining_in_the_middle_of_a_sweep_is_fine(number: int, findings: int) -> None:
+def test_up_to_108_samples_lost_on_joining_are_harmless(number: int, findings: int) -> None:
     assert len(counter_findings("palm", {"unsynchronised_packets": number})) == findings
 
 
@@ -177,7 +177,7 @@ def test_joining_in_the_middle_of_a_sweep_is_fine(number: int, findings: int) ->
         (DeviceFault.BUS_ERROR, Level.WARNING, Cause.BUS_ERRORS, "terminators"),
     ],
 )
-def test_a_fact_is_judged_by_its_fault_alone(
+def test_a_device_fact_gets_level_cause_and_advice_by_fault(
     fault: DeviceFault | None, level: Level, cause: Cause | None, advice: str
 ) -> None:
     up, finding = device_findings("spi", {"link": Fact("up"), "some key": Fact("xxx", fault)})
@@ -188,10 +188,10 @@ def test_a_fact_is_judged_by_its_fault_alone(
 
 
 @pytest.mark.parametrize("cause", LinkCause)
-def test_a_link_down_is_an_error_of_one_cause(
+def test_each_link_fault_is_an_error_with_cause_and_advice(
     cause: LinkCause,
 ) -> None:
-    """Which cause that is, test_link_faults and test_causes hold by what twins and ports do."""
+    """test_link_faults and test_causes check which cause it is."""
     told = set()
     for why in ("no answer from /dev/x", "something new"):
         device = {"link": Fact("waiting", cause), "why": Fact(why)}
@@ -203,7 +203,7 @@ def test_a_link_down_is_an_error_of_one_cause(
     assert None not in told
 
 
-def test_the_page_names_every_cause_once_and_nothing_else() -> None:
+def test_connect_md_names_every_cause_once_and_nothing_else() -> None:
     page = (Path(__file__).parents[3] / "deploy/CONNECT.md").read_text()
     _, causes = page.split("texts may change.\n")
     assert sorted(re.findall(r"`([^`]+)`", causes)) == sorted(Cause)
@@ -254,7 +254,7 @@ def test_many_damaged_or_lost_frames_are_an_error(counters: dict[str, int], leve
 
 
 @pytest.mark.parametrize("now", [LinkCause.NOT_FOUND, LinkCause.SILENT, LinkCause.DISCONNECTED])
-def test_a_link_that_comes_and_goes_is_one_cause(now: LinkCause) -> None:
+def test_a_flapping_link_counts_as_lost_unless_access_is_denied(now: LinkCause) -> None:
     (finding,) = device_findings("spi", {"link": Fact("waiting", now)}, {"link_losses": 4})
     assert (finding.level, finding.cause) == (Level.ERROR, Cause.LINK_LOST)
     denied = Fact("waiting", LinkCause.DENIED)
@@ -262,7 +262,7 @@ def test_a_link_that_comes_and_goes_is_one_cause(now: LinkCause) -> None:
     assert finding.cause is Cause.PORT_DENIED
 
 
-def test_what_the_kernel_says_of_controllers_is_read(tmp_path: Path) -> None:
+def test_state_and_bit_rate_of_can_interfaces_are_read(tmp_path: Path) -> None:
     for name, state in (("can0", "up"), ("vcan0", "unknown"), ("can1", "down")):
         (tmp_path / "net" / name).mkdir(parents=True)
         (tmp_path / "net" / name / "type").write_text("280\n")
@@ -287,7 +287,7 @@ def test_what_the_kernel_says_of_controllers_is_read(tmp_path: Path) -> None:
     assert [interface.state for interface in without] == ["up", "down", "up"]
 
 
-def test_a_process_that_ends_meanwhile_hides_no_holder_of_a_port(
+def test_a_process_that_ends_meanwhile_hides_no_port_holder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Processes of `/proc`: 8 ends while it is looked at, 9 has the socket of port 8080."""

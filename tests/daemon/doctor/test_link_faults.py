@@ -1,4 +1,4 @@
-"""Each fault of a link is told by its cause; nothing else is accused, and no healthy link."""
+"""The doctor reports each fault of a link by its cause alone, and nothing on a healthy link."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from tests.drivers.can.test_can_socket import over_socket
 LOOK_S = 3
 QUARTER_S, EVERY_S = 900, 20
 HAND_HZ = 10.0
-"""Moments of the hand in a second of its own: the link plays them faster, a look in less time."""
+"""Moments of the hand in a second of its own time, which is faster than that of the link."""
 
 LINK_FAULTS: dict[str, tuple[LinkFaults, dict[str, Cause]]] = {
     "damaged bytes": (
@@ -86,14 +86,14 @@ LINK_FAULTS: dict[str, tuple[LinkFaults, dict[str, Cause]]] = {
     ),
     "a silent board": (LinkFaults(drop_probability=1.0), dict.fromkeys(LINKS, Cause.SILENT)),
 }
-"""Faults of a link, and which cause is told of each link that can have them."""
+"""Faults of a link, and the cause that the doctor reports on each link that can have them."""
 
 
 @pytest.mark.parametrize(
     ("fault", "kind"),
     [(fault, kind) for fault, (_, causes) in LINK_FAULTS.items() for kind in causes],
 )
-def test_only_the_fault_of_a_link_is_told(fault: str, kind: str, tmp_path: Path) -> None:
+def test_a_link_fault_is_reported_by_its_cause_alone(fault: str, kind: str, tmp_path: Path) -> None:
     faults, expected = LINK_FAULTS[fault]
     statistics = ElectrodeStatistics(FINGERS)
     with LINKS[kind](Hand(100.0), tmp_path, faults) as (driver, step):
@@ -109,7 +109,7 @@ def test_only_the_fault_of_a_link_is_told(fault: str, kind: str, tmp_path: Path)
     ("attribute", "value", "cause"),
     [("FIRMWARE", FIRMWARE - 1, Cause.FIRMWARE_OLD), ("TICK_HZ", 1_050_000, Cause.CLOCK)],
 )
-def test_a_fault_of_a_bridge_is_told(
+def test_old_firmware_or_wrong_clock_of_a_bridge_is_reported(
     attribute: str, value: int, cause: Cause, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     statistics = ElectrodeStatistics(FINGERS)
@@ -122,7 +122,7 @@ def test_a_fault_of_a_bridge_is_told(
 
 @pytest.mark.parametrize("scene", SEQUENCES)
 @pytest.mark.parametrize("board", SEQUENCES)
-def test_a_board_of_another_sequence_is_told(scene: str, board: str) -> None:
+def test_another_sampling_sequence_on_the_can_board_is_reported(scene: str, board: str) -> None:
     stream = CanStream("bus", FINGERS, sequence=scene)
     stream.link.greeting()
     twin = CanTwin("virtual", "bus", iter(Hand(100.0)), sequence=board)
@@ -138,7 +138,9 @@ def test_a_board_of_another_sequence_is_told(scene: str, board: str) -> None:
     assert causes == ({Cause.SETTINGS} if scene != board else set())
 
 
-def test_a_bus_that_is_lost_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bus_off_and_a_can_interface_going_down_are_reported(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     with SocketBus() as bus:
         stand_in(monkeypatch, lambda: bus)
         with over_socket() as driver:
@@ -170,7 +172,7 @@ SLCAN = CAN + 'interface = "slcan"\n'
         (SLCAN, errno.EACCES, "port-denied"),
     ],
 )
-def test_a_port_that_cannot_be_opened_is_told(
+def test_a_port_that_fails_to_open_is_reported_by_cause(
     tactile: str, number: int, cause: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("serial.serial_for_url", refused(number))
