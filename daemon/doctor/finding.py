@@ -101,7 +101,7 @@ EXPLAINS: dict[Cause | None, frozenset[Cause]] = {
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Text on `what` was found, and how bad it is. Level `OK` has no cause and advice, others do."""
+    """Result of an examination. Level `OK` has no cause and no advice, other levels have both."""
 
     level: Level
     what: str

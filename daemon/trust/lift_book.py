@@ -39,7 +39,7 @@ class Peer(NamedTuple):
 
     @property
     def name(self) -> tuple[bytes, bytes]:
-        """Credential and the part of the routing id that stay the same when the peer reconnects."""
+        """Part of the routing id, and credential, that stay the same when the peer reconnects."""
         return self.routing_id[:NAME_BYTES], self.credential
 
 
@@ -177,8 +177,8 @@ class LiftBook:
         return is_abandoned
 
     def claim(self, grasp: GraspId, peer: Peer) -> bool:
-        """Make a peer the owner of a grasp; return False if it has another owner or its lift is
-        over."""
+        """Let a peer lift a grasp, and own it unless a peer with its credential does. Return False
+        if another credential owns it, its outcome is known, or it is not in the book."""
         lift = self._lifts.get(grasp)
         if lift is None or lift.slipped is not None:
             return False
@@ -217,7 +217,7 @@ class LiftBook:
         return True
 
     def offered(self, peer: Peer) -> GraspId | None:
-        """Return the last grasp that this connection may lift, if it has no outcome yet."""
+        """Return the newest grasp without outcome that this connection owns, or None."""
         for lift in reversed(self._lifts.values()):
             if lift.owner == peer and lift.slipped is None:
                 return lift.id
@@ -238,7 +238,7 @@ class LiftBook:
         """Return True if this peer may report the outcome: the grasp's owner, or None (the daemon).
 
         The last peer that could lift may also report for other owners with its credential, and for
-        grasps without an owner.
+        grasps without an owner; any peer may for a grasp that is not in the book.
         """
         lift = self._lifts.get(grasp)
         if peer is None or lift is None or self.owns(grasp, peer):
@@ -282,7 +282,7 @@ class LiftBook:
         return LiftBookState(lifts, told, self.unreported, self.announced)
 
     def restore(self, state: LiftBookState, width: int) -> None:
-        """Continue from an earlier state, with features (width,). Raises `ValueError`."""
+        """Continue from an earlier state, of `width` features per grasp. Raises `ValueError`."""
         lifts = {lift.id: lift for lift in state.records}
         if len(lifts) != len(state.records):
             raise ValueError("holds a grasp twice")

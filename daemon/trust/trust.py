@@ -24,9 +24,9 @@ from graspd.models.trust.learner import Learner, LearnerState, of_format_2
 from graspd.models.trust.risk import Permission, Risk, RiskLimits, RiskOutcomes, RiskState
 
 VERSION: Final = 3
-"""Format of a state. In format 2 a learner held the result of `at_told`, in 1 no residual."""
+"""Format of a state. Format 2 held the learner's `at_told`, format 1 no residual."""
 MAX_BYTES: Final = 1 << 20
-"""Largest uncompressed state, bytes; three fingers with all outcomes still out take 620 kB."""
+"""Largest uncompressed state, bytes; three fingers with no outcome known yet take 620 kB."""
 DIGEST_BYTES: Final = 32
 
 
@@ -55,8 +55,8 @@ class Trust:
     ) -> None:
         """Start with no outcome.
 
-        `model`: digest of the model. `inputs`: its input features, 78 for three fingers. With
-        `learns` false outcomes move only the risk's budget.
+        `model`: digest of the model. `inputs`: number of its input features, 78 for three fingers.
+        `limits` None: no risk. With `learns` false outcomes move only the risk's budget.
         """
         self._model = model
         self.learns = learns
@@ -110,7 +110,7 @@ class Trust:
         return former if permission is former.permission else replace(former, permission=permission)
 
     def note(self, grasp: GraspId, assessment: Assessment, *, stable: bool) -> None:
-        """Enter the verdict on a grasp in the book. Raises `ValueError` if it was not allowed."""
+        """Enter a grasp's verdict in the book. Raises `ValueError` if `stable` is not allowed."""
         if stable and assessment.permission is not Permission.ALLOWED:
             raise ValueError(f"grasp {grasp.grasp} was called stable: {assessment.permission}")
         if self.lifts.note(grasp, assessment.features, stable=stable):
@@ -133,9 +133,9 @@ class Trust:
     def sensors_exchanged(
         self, learned: LearnerState | None = None, proven: int = 0, budget: float | None = None
     ) -> None:
-        """Learn from the start, or from `learned`. Raises `ValueError` for another model's.
+        """Start again for new sensors. Raises `ValueError` for a `learned` of another model.
 
-        `proven`, `budget`: for the risk; see `Exchanged`.
+        `learned`: earlier learning on them; None: none. `proven`, `budget`: see `Exchanged`.
         """
         self.learner.reset()
         if learned is not None:
@@ -169,7 +169,7 @@ class Trust:
 
 
 def encode(state: TrustState) -> bytes:
-    """Return the SHA-256 and the bytes of a state; takes some milliseconds."""
+    """Return the SHA-256 and the compressed bytes of a state; takes some milliseconds."""
     data = zlib.compress(msgspec.msgpack.encode(state), 1)
     return hashlib.sha256(data).digest() + data
 
@@ -188,7 +188,7 @@ def decode(data: bytes) -> TrustState:
 
 
 def of_this_format(state: TrustState) -> TrustState:
-    """Return a state in the current format. Raises `ValueError`, or `FormatError`."""
+    """Return a state, converted if of format 2. Raises `ValueError`; `FormatError` for others."""
     _check(state.version)
     if state.version == VERSION:
         return state

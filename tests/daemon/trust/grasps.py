@@ -1,4 +1,4 @@
-"""Grasps that one small trust judges, and their outcomes."""
+"""A small `Trust`, and grasps for it to judge."""
 
 from __future__ import annotations
 

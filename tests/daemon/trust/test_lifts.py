@@ -26,7 +26,7 @@ from graspd.models.trust.risk import Permission, RiskLimits
 from tests.daemon.trust.grasps import INPUTS, inputs, named, trust
 
 BOOK = 6
-"""Grasps that are remembered here."""
+"""Most grasps in the book here."""
 ALPHAS = st.sampled_from((None, 0.001, 0.05, 0.1, 0.5))
 PEERS = [
     Peer(name, user)
@@ -35,7 +35,7 @@ PEERS = [
 ]
 MARGINS = st.sampled_from((-9.0, -9.0, -4.0, -1.0, 3.0))
 BACK = st.sampled_from((0, 0, 0, 1, 1, 2, 3, 5, 7))
-"""Which grasp, counted back from the newest."""
+"""Number of a grasp, counted back from the newest."""
 
 
 @dataclass
@@ -44,7 +44,7 @@ class Lift:
 
     stable: bool
     lesson: bytes | None
-    """Its features; None once nothing is to be learned from it."""
+    """Features of the grasp; None once nothing is to be learned from it."""
     slipped: bool | None = None
     announced: bool = False
     owner: Peer | None = None
@@ -101,7 +101,7 @@ class Model:
         return status
 
     def may_report(self, lift: Lift, peer: Peer) -> bool:
-        """The owner, by any connection; else the last lifter, of the owner's user."""
+        """True for the owner, by any connection, and the last lifter if it is of the same user."""
         names = [each and (each.routing_id[:16], each.credential) for each in (lift.owner, peer)]
         is_last = self.lifter and (self.lifter.routing_id[:16], self.lifter.credential) == names[1]
         is_heir = lift.owner is None or lift.owner.credential == peer.credential
@@ -112,7 +112,7 @@ class Model:
 
 
 class Lifts(RuleBasedStateMachine):
-    """One hand's trust, its controllers, and the model beside it."""
+    """Random events for a `Trust`, its controllers, and the model that must agree with it."""
 
     @initialize(alpha=ALPHAS, most=st.sampled_from((1, 2, 5)))
     def start(self, alpha: float | None, most: int) -> None:
@@ -124,7 +124,7 @@ class Lifts(RuleBasedStateMachine):
 
     @rule()
     def save(self) -> None:
-        """Have all on the disk, to which a kill leads back."""
+        """Save the state, from which a restart after a kill continues."""
         for number in self.model.lifts:
             self.part.lifts.keep(named(number))
         self.model.unkept.clear()
@@ -152,7 +152,7 @@ class Lifts(RuleBasedStateMachine):
 
     @rule(stable=st.booleans(), margin=st.none() | MARGINS)
     def judge_what_cannot_be_assessed(self, stable: bool, margin: float | None) -> None:
-        """With a `margin` it can be at the next reading."""
+        """The grasp is assessed at the next reading if a `margin` is given."""
         stable = stable and self.model.alpha is None
         self.number += 1
         self.part.note(named(self.number), Assessment(0), stable=stable)
@@ -285,14 +285,16 @@ class Lifts(RuleBasedStateMachine):
             assert book.offered(peer) == (named(max(own)) if own else None)
 
     def teardown(self) -> None:
-        """All was learned, and nothing else."""
+        """Check that all outcomes with features were learned, and nothing else."""
         learner = Learner(INPUTS)
         for lesson, slipped in self.model.lessons:
             learner.learn(np.frombuffer(lesson, "<f8"), slipped=slipped)
         assert self.part.learner.state() == learner.state()
 
 
-def test_lifts_in_any_order_are_as_the_model(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_trust_agrees_with_a_plain_model_after_random_events(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     decode(encode(Trust("model", INPUTS).state()))  # later tests read states of the usual size
     monkeypatch.setattr("graspd.daemon.trust.lift_book.LIFTS_MAX", BOOK)
     run_state_machine_as_test(

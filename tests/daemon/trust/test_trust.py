@@ -57,7 +57,7 @@ def test_stable_cannot_be_noted_where_it_was_not_allowed() -> None:
             part.note(named(0), assessment, stable=True)
 
 
-def test_an_allowed_grasp_is_reviewed_before_it_is_called_stable() -> None:
+def test_reviewing_allowed_grasps_keeps_slips_within_the_bound() -> None:
     part, names = trust(RiskLimits(0.05)), list(map(named, range(30)))
     early = [part.judge(name, 1e-6, -13.8, inputs(0)) for name in names]
     assert {each.permission for each in early} == {Permission.ALLOWED}
@@ -71,7 +71,7 @@ def test_an_allowed_grasp_is_reviewed_before_it_is_called_stable() -> None:
 
 
 @pytest.mark.parametrize("permission", Permission, ids=str)
-def test_a_grasp_that_was_not_allowed_stays_so(permission: Permission) -> None:
+def test_a_review_without_new_outcomes_keeps_the_permission(permission: Permission) -> None:
     part = trust()
     former = replace(part.judge(named(1), 1e-6, -13.8, inputs(1)), permission=permission)
     assert part.review(named(1), former).permission is permission
@@ -84,12 +84,14 @@ def test_a_grasp_that_was_not_allowed_stays_so(permission: Permission) -> None:
         (0.5, math.nan, "not finite"),
     ],
 )
-def test_other_values_than_probabilities_are_refused(p: float, margin: float, says: str) -> None:
+def test_p_slip_or_margin_that_no_network_gives_is_refused(
+    p: float, margin: float, says: str
+) -> None:
     with pytest.raises(ValueError, match=says):
         trust().judge(named(0), p, margin, inputs(0))
 
 
-def test_a_state_is_not_changed_by_what_comes_later() -> None:
+def test_a_saved_state_is_not_changed_by_later_outcomes() -> None:
     part = trust()
     judge(part, 0)
     state = part.state()
@@ -100,7 +102,7 @@ def test_a_state_is_not_changed_by_what_comes_later() -> None:
     assert encode(state) == kept
 
 
-def test_the_largest_state_of_three_fingers_fits() -> None:
+def test_the_largest_state_of_three_fingers_can_be_restored() -> None:
     part = Trust("f" * 64, 78, RULE)
     random = np.random.default_rng(0)
     for grasp in range(2 * LIFTS_MAX):
@@ -124,7 +126,7 @@ def full() -> Trust:
     return part
 
 
-def test_no_damaged_byte_goes_unnoticed() -> None:
+def test_a_state_with_a_damaged_byte_is_refused() -> None:
     data = encode(full().state())
     for place in range(0, len(data), 97):
         damaged = bytearray(data)
@@ -138,7 +140,7 @@ def test_no_damaged_byte_goes_unnoticed() -> None:
 
 
 def too_many() -> bytes:
-    """A state of one record more than is remembered."""
+    """A state, without its digest, with one grasp more than the book may have."""
     state = full().state()
     many = tuple(replace(state.lifts.records[0], id=named(n)) for n in range(LIFTS_MAX + 1))
     return encode(replace(state, lifts=replace(state.lifts, records=many)))[DIGEST_BYTES:]
@@ -149,12 +151,12 @@ def too_many() -> bytes:
     [b"\x80", b"\xc1", msgspec.msgpack.encode({"version": 2}), too_many()],
     ids=["empty", "no message", "not compressed", "too many records"],
 )
-def test_what_is_whole_and_no_state_is_refused(content: bytes) -> None:
+def test_other_content_with_a_right_digest_is_refused(content: bytes) -> None:
     with pytest.raises(ValueError, match="nothing that was learned"):
         decode(hashlib.sha256(content).digest() + content)
 
 
-def test_what_another_graspd_kept_is_refused_by_its_format() -> None:
+def test_a_state_of_format_1_or_4_is_refused() -> None:
     for version in (1, 4):
         state = msgspec.to_builtins(full().state(), builtin_types=(bytes,))
         state["version"] = version
@@ -166,7 +168,7 @@ def test_what_another_graspd_kept_is_refused_by_its_format() -> None:
             decode(hashlib.sha256(content).digest() + content)
 
 
-def test_a_state_of_format_2_teaches_the_same() -> None:
+def test_a_state_of_format_2_gives_equal_probabilities() -> None:
     part, later = full(), trust()
     state = part.state()
     mean, covariance = (each.tobytes() for each in part.learner.at_told())
@@ -175,7 +177,7 @@ def test_a_state_of_format_2_teaches_the_same() -> None:
     assert p_slip(later) == pytest.approx(p_slip(part), abs=1e-9)
 
 
-def test_a_state_of_something_else_is_refused_and_changes_nothing() -> None:
+def test_a_state_that_does_not_fit_is_refused_changing_nothing() -> None:
     part = full()
     before = encode(part.state())
     state = part.state()
