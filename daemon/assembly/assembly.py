@@ -77,7 +77,7 @@ def build_pipeline(
     *,
     learns: bool = True,
 ) -> Pipeline:
-    """Build the scene's judge. Raises `ModelError`."""
+    """Build the scene's judge; if it `learns`, judged grasps calibrate it. Raises `ModelError`."""
     scene = plan.scene
     _refuse_other_fingers(scene, model)
     limits = Limits(
@@ -168,7 +168,7 @@ def open_driver(driver: Driver) -> None:
 
 
 def open_file(scene: Scene, driver: Driver) -> None:
-    """Open the tactile driver if it plays files, and read the joints' calibration; no device.
+    """Open the tactile driver if it plays files, and read the joints' calibration; open no device.
 
     Raises as `open_driver`, and `DriverError` for a wrong calibration.
     """
@@ -219,7 +219,7 @@ def player(
 ) -> ReplayDriver | BagDriver | McapReplayDriver:
     """Make the driver that plays a scene's recordings; `speed` None: fast. Raises `ValueError`.
 
-    `strict`: a value that is not a count ends a table.
+    `strict`: a value in a table that is not a count ends the replay with an error.
     """
     fingers, kind = plan.scene.hand.fingers, recorded_kind(options)
     if kind in BAGS:

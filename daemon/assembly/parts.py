@@ -58,7 +58,7 @@ class Parts:
     ) -> Parts:
         """Make the parts. Raises `SceneError` or `ModelError`.
 
-        `player`: takes the place of the scene's drivers. `clock`: the judge's now, ns.
+        `player`: takes the place of the scene's drivers. `clock`: gives the judge the time, ns.
         """
         assembly.refuse_absent_processors(plan.scene)
         pipeline = assembly.build_pipeline(plan, model, clock, learns=plan.scene.session.learn)
@@ -82,7 +82,7 @@ class Assembly:
         self._tap: Tap | None = None
 
     def open_sockets(self, high_water_mark: int | None = None) -> Sockets:
-        """Open the sockets, as `Sockets` does."""
+        """Open the scene's sockets until the stack closes. `high_water_mark`: see `Sockets`."""
         from graspd.daemon.publish.sockets import Sockets
 
         sockets = Sockets(self._parts.scene, high_water_mark=high_water_mark)

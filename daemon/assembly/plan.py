@@ -27,7 +27,7 @@ class Plan:
     joints: bool
     """True if joint angles come, from their own source or in a recording."""
     without_outcomes: tuple[Path, ...] = ()
-    """Grasp tables and streams that do not say how the lifts ended."""
+    """Grasp tables, streams and bags that do not say how the lifts ended."""
     layouts: Mapping[Path, Layout] = field(default_factory=dict)
     """Layouts of the scene's tables and streams."""
 

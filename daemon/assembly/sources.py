@@ -38,16 +38,15 @@ class Source:
     """Recorded readings to judge again, and the sections of the scene that judges them."""
 
     def __init__(self, sections: Mapping[str, dict[str, Any]], where: Path) -> None:
-        """`where`: the file of the sections, for messages."""
+        """`sections`: those of the scene by name. `where`: their file, for messages."""
         self._sections = sections
         self._where = where
 
     def scene(self, publish: dict[str, Any], model: dict[str, Any], mode: str | None) -> Scene:
-        """Return the scene with `publish` and `model` in place; the model's thresholds stay.
+        """Return the scene with the keys `publish` for `[publish]`. Raises `SceneError`.
 
+        `model`: name or path of another model, whose thresholds stay; empty: the same model.
         `mode`: mode of the gate; None: as recorded.
-
-        Raises `SceneError`.
         """
         former = self._sections.get("model", {})
         if model:

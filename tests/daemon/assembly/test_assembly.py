@@ -52,7 +52,7 @@ def test_the_scene_decides_on_learning_and_risk(text: str) -> None:
 
 
 @pytest.mark.parametrize("threshold", [1e-9, 1 - 1e-9])
-def test_the_threshold_of_the_scene_decides(threshold: float) -> None:
+def test_slip_threshold_and_max_age_of_the_scene_decide(threshold: float) -> None:
     scene = scene_of(REPLAY, model={"slip_threshold": threshold}, gate={"max_age_ms": 1.0})
     driver = assembly.build_drivers(Plan.of(scene))[0]
     driver.open()
@@ -67,8 +67,8 @@ def test_the_threshold_of_the_scene_decides(threshold: float) -> None:
     assert pipeline.judge(reading(clock() - 1_500_000)).decision is Decision.UNKNOWN
 
 
-def test_a_table_is_judged_as_its_readings_are_handed_over() -> None:
-    """The reading is as old as the computer's start, by its own clock."""
+def test_a_replayed_table_measures_age_by_the_drivers_clock() -> None:
+    """Now is the driver's `handed_over_ns`; by the computer's clock both readings were stale."""
     source = Tables([DEMO_TABLE], {})
     scene = source.scene({}, {}, None)
     parts = source.parts(scene, assembly.load_model(scene), None)
@@ -104,7 +104,7 @@ SOME = [
         ("small-session", ("ff", "rf"), "small-session"),
     ],
 )
-def test_a_hand_gets_the_models_form_for_its_fingers(
+def test_a_hand_with_fewer_fingers_gets_a_fitting_model_file(
     name: str | None, fingers: tuple[str, ...], file: str
 ) -> None:
     scene = hand(fingers) if name is None else hand(fingers, name=name)
@@ -137,7 +137,7 @@ def test_a_model_of_other_fingers_is_refused_with_fitting_names(scene: Scene, sa
     ],
     ids=["spi", "can", "spi-sensors", "palm"],
 )
-def test_fingers_in_another_order_are_told_what_to_write_instead(
+def test_fingers_in_another_order_are_refused_with_working_advice(
     tactile: dict[str, Any], sensors: list[str] | None
 ) -> None:
     scene = hand(("th", "ff"), tactile)
@@ -189,7 +189,7 @@ BEHIND = ("th", "ff", "mf")
         ("recordings.csv_player.ReplayDriver", REPLAY | {"pace": "fast"}, {"speed": None}),
     ],
 )
-def test_a_driver_is_told_what_the_scene_says(
+def test_a_driver_gets_the_options_of_the_scene(
     monkeypatch: pytest.MonkeyPatch, driver: str, tactile: dict[str, Any], told: dict[str, Any]
 ) -> None:
     monkeypatch.setattr(f"graspd.drivers.{driver}", Constructed)
@@ -208,7 +208,9 @@ def test_a_driver_is_told_what_the_scene_says(
         (ValueError("baud"), SceneError),
     ],
 )
-def test_only_a_link_is_worth_another_try(raised: Exception, expected: type[Exception]) -> None:
+def test_open_driver_raises_scene_error_except_for_link_errors(
+    raised: Exception, expected: type[Exception]
+) -> None:
     class Refusing(FakeDriver):
         def open(self) -> None:
             raise raised
@@ -217,7 +219,7 @@ def test_only_a_link_is_worth_another_try(raised: Exception, expected: type[Exce
         assembly.open_driver(Refusing([], Clock()))
 
 
-def test_outcomes_that_no_recording_has_cannot_be_told(tmp_path: Path) -> None:
+def test_replaying_outcomes_needs_a_recording_that_has_them(tmp_path: Path) -> None:
     bare = tmp_path / "bare.csv"
     header, row, *_ = DEMO_TABLE.read_text().splitlines()
     bare.write_text(header.replace("slipped", "other") + f"\n{row}\n")

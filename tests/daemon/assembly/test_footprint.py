@@ -17,7 +17,7 @@ SCENES = sorted((DEPLOY / "scenes").glob("*.toml"))
 
 
 def ours(*names: str) -> set[str]:
-    """Modules of graspd."""
+    """Full names of modules of graspd."""
     return {f"graspd.{name}" for name in names}
 
 
@@ -43,7 +43,7 @@ BUSES = {
     "palm": ours("drivers.palm.stream", "drivers.palm.packet"),
     "datagrams": ours("drivers.datagrams.tactile"),
 }
-"""Modules that only this driver needs; python-can brings asyncio and sqlite3."""
+"""Modules that only one driver needs, by driver; python-can brings asyncio and sqlite3."""
 JOINTS = ours("daemon.judge.joint_motion", "drivers.datagrams.joints")
 HALL = ours("drivers.palm.calibration")
 GATE = ours(*(f"daemon.judge.{name}" for name in ("gate", "contact", "hand", "stillness")))
@@ -79,18 +79,18 @@ SIGNALS = 2
 SOCKET = 14
 """Descriptors of a socket at a path, and of the sockets and pipes to the process that serves it."""
 ASK_SOCKET = 3
-"""Descriptors of a second one."""
+"""Descriptors that a second socket adds."""
 ZMQ_THREADS = 2
-"""One serves sockets, one closes them. Those of peers are in a process of their own."""
+"""Threads of ZeroMQ: one serves sockets, one closes them. Peers are served by another process."""
 FILE = 1
-"""The recording that plays, or the lock of the kept session."""
+"""Descriptor of the recording that plays, or of the lock of the kept session."""
 
 
 @pytest.fixture(autouse=True)
 def as_everywhere(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave out the threads that libraries start by the machine's cores.
+    """Let libraries start the same threads everywhere: none per core.
 
-    Of onnxruntime's telemetry, on by default from 1.29 on and off in CI, nothing is counted.
+    The telemetry of onnxruntime, on by default from 1.29 on, is off as in CI.
     """
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "ORT_DISABLE_TELEMETRY"):
         monkeypatch.setenv(name, "1")
@@ -102,7 +102,7 @@ def below(names: set[str], modules: tuple[str, ...]) -> list[str]:
 
 
 @pytest.mark.parametrize("scene", SCENES, ids=lambda path: path.stem)
-def test_an_example_scene_costs_only_what_it_needs(scene: Path) -> None:
+def test_an_example_scene_takes_only_needed_modules_memory_threads_descriptors(scene: Path) -> None:
     cost = measure(scene)
     assert below(NEVER | FORBIDDEN[scene.stem], cost["modules"]) == []
     assert BUSES[DRIVER.get(scene.stem, scene.stem)] <= set(cost["modules"])
@@ -118,7 +118,7 @@ def test_an_example_scene_costs_only_what_it_needs(scene: Path) -> None:
     assert 5 <= len(cost["judged"]) <= 4 + 60
 
 
-def test_a_table_of_grasps_has_neither_gate_nor_joints(tmp_path: Path) -> None:
+def test_a_replayed_table_loads_neither_gate_nor_joints(tmp_path: Path) -> None:
     found = measure(demo_scene(tmp_path))
     assert below(GATE | JOINTS | HALL | KEPT | ASK, found["modules"]) == []
     assert len(found["judged"]) == len(found["reading"])
