@@ -86,9 +86,9 @@ class Device(NamedTuple):
     name: str
     """Path or pyserial URL of a port, name of a bus, `udp://ADDRESS:PORT`."""
     keys: str
-    """Keys of the section that name it."""
+    """Keys of the section that name the device, as text."""
     part: str = ""
-    """Part of it that the driver takes; empty: all."""
+    """Part of the device that the driver takes, such as one frame id; empty: all."""
     only_from: str | None = None
     """IP address of the sender over UDP; None: any may send."""
 
@@ -167,7 +167,7 @@ class CanTactile(DriverSection):
 
     @property
     def device(self) -> Device:
-        """Return the bus; two drivers share it if their frames have other ids."""
+        """Return the bus; two drivers can share one if the ids of their frames differ."""
         kind = BUS_KINDS.get(self.interface, DeviceKind.BUS)
         return Device(kind, self.channel, "channel and arbitration_id", str(self.arbitration_id))
 
@@ -182,7 +182,7 @@ class UdpSection(DriverSection):
 
     @property
     def device(self) -> Device:
-        """Return the address that it listens on."""
+        """Return the address that the driver listens on."""
         return Device(DeviceKind.UDP, self.source, "source", only_from=self.only_from)
 
 

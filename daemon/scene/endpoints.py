@@ -11,7 +11,7 @@ IPC_PATH_MAX_BYTES = 107
 
 
 def check_endpoint(endpoint: str) -> str:
-    """Return `endpoint` if ZeroMQ can bind to it. Raises `ValueError`."""
+    """Return `endpoint` if it has a form that can be bound. Raises `ValueError`."""
     scheme, separator, address = endpoint.partition("://")
     if not separator or scheme not in {"ipc", "tcp"}:
         raise ValueError("must start with ipc:// or tcp://")

@@ -22,7 +22,7 @@ MESSAGE_MAX = 320
 
 
 def lines_of(error: ValidationError, scene: Section, path: Path) -> list[str]:
-    """Return a line for each mistake that pydantic found, at most `LINES_MAX`."""
+    """Return a line for each mistake that pydantic found; after `LINES_MAX` the number of more."""
     mistakes = error.errors(include_url=False)
     inner = {mistake["loc"][:depth] for mistake in mistakes for depth in range(len(mistake["loc"]))}
     # A wrong item also makes its list wrong; only the item gets a line.
@@ -65,7 +65,7 @@ def _shown(value: object) -> str:
 
 
 def _place(scene: Section, location: tuple[int | str, ...]) -> tuple[list[str], Section | None]:
-    """Return the keys that lead to a location, and the section with the last of them.
+    """Return the keys that lead to a location, and the section with the last of them, or None.
 
     The driver's name, which pydantic puts between the keys, is left out.
     """

@@ -54,7 +54,7 @@ def schema() -> dict[str, Any]:
 
 
 def schema_text() -> str:
-    """Return the text of the schema's file."""
+    """Return the text of the file `SCHEMA`."""
     return json.dumps(schema(), indent=2) + "\n"
 
 
@@ -73,7 +73,7 @@ def page() -> str:
 
 
 def _describe(about: dict[str, Any]) -> None:
-    """Add the unit of a key to its meaning. A section takes the meaning of its class."""
+    """Add a key's unit to its description; a section takes the description of its class."""
     meaning = " ".join(about.pop("description", "").split())
     if "$ref" in about:
         about.pop("default", None)
@@ -89,7 +89,7 @@ def _unit(about: Mapping[str, Any]) -> str:
 
 
 def _plain(node: Any, sections: Mapping[str, Any]) -> Any:  # noqa: ANN401
-    """Return a schema with each section in its place, without null and titles."""
+    """Return a schema with `sections` in place of references to them, without null and titles."""
     if isinstance(node, list):
         return [_plain(item, sections) for item in node]
     if not isinstance(node, dict):
@@ -111,7 +111,7 @@ def _plain(node: Any, sections: Mapping[str, Any]) -> Any:  # noqa: ANN401
 
 
 def _sections(of: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
-    """Yield the sections below one, in the order of the file."""
+    """Yield all sections below the section `of`, in the order of the file."""
     for about in of["properties"].values():
         for section in about.get("oneOf", (about,)):
             if "properties" in section:
@@ -168,5 +168,5 @@ def _number(value: float) -> str:
 
 
 def _linked(text: str) -> str:
-    """Return text in which names of files in deploy are links, from that folder."""
+    """Return text in which names of files in deploy are links for a page in that folder."""
     return re.sub(r"deploy/([\w./-]+\w)", r"[\1](\1)", " ".join(text.split()))

@@ -1,4 +1,4 @@
-"""What is told of a scene's keys is what its classes do."""
+"""Schema, page and examples of the scene agree with its classes."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from tests.kit.inside import graspd
 DEPLOY = Path(__file__).parents[3] / "deploy"
 SCHEMA = explained.schema()
 UNITS = {"_ms": "ms", "_s": "s", "_hz": "1/s", "_mb": "MB", "_minutes": "minutes"}
-"""What the end of a key's name says of its unit."""
+"""Unit of a key by the end of its name."""
 
 
 def keys_of(section: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """All keys of all sections, with what is said of each."""
+    """All keys of all sections, by path, with the schema of each."""
     for key, about in section["properties"].items():
         yield f"{path}{key}", about
         for inner in about.get("oneOf", (about,)):
@@ -76,7 +76,7 @@ def test_the_page_of_all_keys_is_up_to_date() -> None:
 
 
 @pytest.mark.parametrize("name", explained.examples())
-def test_an_example_is_the_file_in_deploy_and_right_anywhere(name: str, tmp_path: Path) -> None:
+def test_an_example_scene_passes_check_in_any_folder(name: str, tmp_path: Path) -> None:
     result = graspd("scene", "--example", name)
     assert result.returncode == 0, result.stderr
     path = tmp_path / "right.toml"

@@ -109,7 +109,9 @@ def test_a_mistake_is_one_line_naming_file_and_key(
         (b"#" * (SCENE_MAX_BYTES + 1), "larger than 131072 bytes"),
     ],
 )
-def test_what_is_not_toml_is_said_in_one_line(tmp_path: Path, content: bytes, says: str) -> None:
+def test_an_unreadable_scene_file_is_refused_in_one_line(
+    tmp_path: Path, content: bytes, says: str
+) -> None:
     path = tmp_path / "scene.toml"
     path.write_bytes(content)
     with pytest.raises(SceneError, match=says) as error:
@@ -117,7 +119,7 @@ def test_what_is_not_toml_is_said_in_one_line(tmp_path: Path, content: bytes, sa
     assert "\n" not in str(error.value)
 
 
-def test_of_many_mistakes_twenty_are_told(tmp_path: Path) -> None:
+def test_of_many_mistakes_twenty_are_listed(tmp_path: Path) -> None:
     path = written(tmp_path, GOOD + "".join(f"wrong{number} = 1\n" for number in range(1000)))
     with pytest.raises(SceneError) as error:
         load(path)
@@ -136,14 +138,14 @@ def test_of_many_mistakes_twenty_are_told(tmp_path: Path) -> None:
         GOOD + f"[publish]\nendpoint = 'tcp://{'x' * 100_000}:1'",
     ],
 )
-def test_a_long_value_is_cut(tmp_path: Path, text: str) -> None:
+def test_a_long_value_is_cut_in_the_message(tmp_path: Path, text: str) -> None:
     path = written(tmp_path, text)
     with pytest.raises(SceneError) as error:
         load(path)
     assert len(str(error.value)) < len(str(path)) + 600
 
 
-def test_control_characters_are_shown_and_not_sent(tmp_path: Path) -> None:
+def test_control_characters_are_escaped_in_the_message(tmp_path: Path) -> None:
     escape = '"\\u001b[2J\\n\\u202e"'
     texts = [f"loop = {escape}", f"{escape} = 1", f"[publish]\nendpoint = {escape}"]
     for text in [*(GOOD + text for text in texts), f"[tactile]\ndriver = {escape}"]:
@@ -207,7 +209,7 @@ def test_equal_endpoints_are_refused_however_written(
         parse(sections, tmp_path / "s.toml")
 
 
-def test_a_byte_order_mark_is_taken(tmp_path: Path) -> None:
+def test_a_utf_8_byte_order_mark_is_accepted(tmp_path: Path) -> None:
     path = tmp_path / "s.toml"
     path.write_bytes(b'\xef\xbb\xbf[tactile]\ndriver = "can"\n')
     assert load(path).tactile.driver == "can"
