@@ -78,7 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
-    """Return a function that runs the command line. Raises `SystemExit` if that is wrong."""
+    """Return a function that runs the command. Raises `SystemExit` for a wrong command line."""
     arguments = sys.argv[1:] if arguments is None else arguments
     named = next((word for word in arguments if not word.startswith("-")), None)
     if named in LINUX and not is_linux():

@@ -124,7 +124,10 @@ class GraspModel:
         return probabilities
 
     def _turn(self) -> threading.Lock:
-        """Return the lock of this process, which a thread holds while it judges."""
+        """Return the lock that a thread of this process holds while it judges.
+
+        Raises `RuntimeError` if this process was forked while a thread judged.
+        """
         own = os.getpid()
         if any(turn.locked() for pid, turn in list(self._turns.items()) if pid != own):
             raise RuntimeError(
@@ -140,7 +143,7 @@ class GraspModel:
     def _begin(
         self, session: str | os.PathLike[str] | ArrayLike | None, read_as: ReadAs | None
     ) -> None:
-        """Begin a session of today's sensors."""
+        """Calibrate by `session` from the start; warn if the model needs more grasps."""
         calibration = self._judge.session
         if calibration is None or not isinstance(self._takes, SessionInput):
             if session is not None:
@@ -166,7 +169,7 @@ class GraspModel:
 def _grasps(
     given: ArrayLike, fingers: Sequence[Finger], read_as: ReadAs | None
 ) -> NDArray[np.float64]:
-    """Return the counts of grasps. Raises `ValueError`, also for a table of sweeps."""
+    """Return counts of shape (n, fingers, 24). Raises `ValueError`, also for a table of sweeps."""
     time_of_sweeps = _time_of(given)
     if time_of_sweeps is not None:
         raise ValueError(
@@ -196,7 +199,7 @@ def _refuse_fingers_by_row(table: Any, names: Sequence[str]) -> None:  # noqa: A
 
 
 def _are_labelled(table: Any) -> bool:  # noqa: ANN401
-    """Return True for rows that each have an object and an outcome, of both kinds."""
+    """Return True if every row has an object and an outcome, and both outcomes occur."""
     if not {OBJECT, SLIPPED} <= set(column_names(table)):
         return False
     labels = (np.asarray(table[name], dtype=object).tolist() for name in (OBJECT, SLIPPED))
@@ -205,7 +208,7 @@ def _are_labelled(table: Any) -> bool:  # noqa: ANN401
 
 
 def _time_of(table: Any) -> str | None:  # noqa: ANN401
-    """Return the column of times; None: there is none. Raises `ValueError` for an index of them."""
+    """Return the name of the column of times or None. Raises `ValueError` for an index of times."""
     index = getattr(table, "index", None)
     kind = getattr(getattr(index, "dtype", None), "kind", "O")
     if kind in "fmM" or time_column([str(name) for name in getattr(index, "names", ())]):
@@ -219,9 +222,9 @@ def _time_of(table: Any) -> str | None:  # noqa: ANN401
 def load(model: str | os.PathLike[str], *, fingers: Sequence[Finger] = ()) -> GraspModel:
     """Return a model by its name (`graspd models` lists them) or by the path of an ONNX file.
 
-    `fingers`: those of the hand, in the order of the counts, for the form of the model that judges
-    fewer. Raises `ModelError`, also for another order than the model's, and `ValueError` for a name
-    that is not a finger's.
+    `fingers`: those of the hand, in the order of the counts, to load the form of the model for a
+    hand that has fewer. Raises `ModelError`, also for another order than the model's, and
+    `ValueError` for a name that is not a finger's.
     """
     check_fingers(fingers)
     found = GraspModel(_path(model, fingers))

@@ -23,7 +23,7 @@ def untouched(bts3_dir: Path) -> NDArray[np.uint16]:
 
 @pytest.fixture(scope="module")
 def counts() -> NDArray[np.float64]:
-    """The demo's grasps, as numpy reads the file."""
+    """Counts of the demo's grasps, as numpy reads the file: shape (n, 3, 24)."""
     rows = np.genfromtxt(DEMO_DAY, delimiter=",", skip_header=1)
     names = DEMO_DAY.read_text().partition("\n")[0].split(",")
     places = [names.index(f"{f}_biotac_{e}") for f in ("ff", "mf", "th") for e in range(1, 25)]

@@ -37,7 +37,7 @@ WIDE = 1e-6
 
 
 def seen_box(fingers: int) -> SeenCounts:
-    """Everything within the range was seen, however the electrodes go together."""
+    """Limits by which all counts from `LOW` to `HIGH` were seen, in any combination."""
     return SeenCounts(
         low=((LOW,) * 24,) * fingers,
         high=((HIGH,) * 24,) * fingers,
@@ -64,7 +64,7 @@ def contract(fingers: tuple[Finger, ...] = FINGERS) -> ModelContract:
 
 
 class FakeModel:
-    """A model that answers what the test says."""
+    """A model that answers `p_slip`, or raises `ModelError` if the test gives an exception."""
 
     def __init__(self, p_slip: float | Exception = 0.1) -> None:
         self.answer = p_slip
@@ -83,7 +83,7 @@ class FakeModel:
 
 
 NO_LIFT = GraspId("", 0), LiftBook()
-"""Ends a `PublishedVerdict` of no grasp."""
+"""Fields `grasp` and `lifts` of a `PublishedVerdict` that is on no grasp."""
 
 
 def pipeline(
@@ -121,7 +121,7 @@ def sound(counts: NDArray[np.generic], t_ns: int = 0, seq: int = 0) -> TactileRe
 
 
 class FakeDriver:
-    """Hands over what the test has queued, one reading per call."""
+    """Hands over what the test has queued, one reading per call; raises queued errors."""
 
     name = "fake"
     live = False

@@ -39,7 +39,7 @@ with zmq.Context() as context, context.socket(zmq.SUB) as socket:
 
 
 def graspd(*arguments: object, timeout_s: float = TIMEOUT_S) -> subprocess.CompletedProcess[str]:
-    """Run a command to its end."""
+    """Run a command of graspd to its end."""
     return subprocess.run(
         [*GRASPD, *map(str, arguments)],
         capture_output=True,
@@ -50,7 +50,7 @@ def graspd(*arguments: object, timeout_s: float = TIMEOUT_S) -> subprocess.Compl
 
 
 class Started(subprocess.Popen[str]):
-    """What a failing test leaves running is not waited for."""
+    """A process that is killed, not waited for, if the test fails."""
 
     def __exit__(self, kind: type[BaseException] | None, *rest: object) -> None:
         if kind is not None:
@@ -66,9 +66,9 @@ def graspd_with(module: str, **constants: object) -> tuple[str, ...]:
 def start(
     *arguments: object, before: Sequence[str] = (), program: Sequence[str] = GRASPD
 ) -> Started:
-    """Start a command, by the words `before` it, and leave it running.
+    """Start a command of graspd, or `program`, after the words `before`; leave it running.
 
-    Before other work, where that may be: a robot's computer leaves it time, one full of tests not.
+    Without `before` its priority is raised if that is permitted: other tests may run meanwhile.
     """
     process = Started(
         [*before, *program, *map(str, arguments)],
@@ -82,14 +82,14 @@ def start(
 
 
 def put_first(pid: int) -> None:
-    """Let a process come before other work, where that may be."""
+    """Raise the priority of a process if that is permitted."""
     with contextlib.suppress(PermissionError):
         os.setpriority(os.PRIO_PROCESS, pid, NICENESS)
 
 
 @contextlib.contextmanager
 def before_others() -> Iterator[None]:
-    """Meanwhile this thread and what it starts come before other work, where that may be."""
+    """Raise the priority of this thread, and of what it starts meanwhile, if that is permitted."""
     former = os.getpriority(os.PRIO_PROCESS, 0)
     put_first(0)
     try:
@@ -99,5 +99,5 @@ def before_others() -> Iterator[None]:
 
 
 def wait_for(path: Path) -> None:
-    """Wait until a file is there."""
+    """Wait until a file exists."""
     wait_until(path.exists, 0.01, says=f"{path} did not appear")

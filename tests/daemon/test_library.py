@@ -30,7 +30,7 @@ PAGE = (ROOT / "deploy" / "LIBRARY.md").read_text()
 
 
 def messages(*words: object) -> list[dict[str, Any]]:
-    """What `graspd replay` says."""
+    """The verdicts that `graspd replay` prints as JSON."""
     done = inside.graspd("replay", *words, "--json")
     return [json.loads(line) for line in done.stdout.splitlines()]
 
@@ -40,7 +40,7 @@ def test_importing_graspd_loads_neither_onnxruntime_nor_numpy() -> None:
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_each_name_of_the_library_is_there_and_told() -> None:
+def test_each_name_of_the_library_exists_and_is_documented() -> None:
     assert dir(graspd) == sorted(graspd.__all__)
     for name in graspd.__all__:
         assert getattr(graspd, name) is not None
@@ -58,7 +58,7 @@ def test_probabilities_are_those_of_a_replay(counts: NDArray[np.float64]) -> Non
     np.testing.assert_allclose(got.sum(axis=1)[np.isfinite(expected)], 1.0)
 
 
-def test_a_session_of_earlier_grasps_is_that_of_a_replay(counts: NDArray[np.float64]) -> None:
+def test_a_session_from_earlier_grasps_judges_as_a_replay_does(counts: NDArray[np.float64]) -> None:
     said = messages(DEMO_DAY)
     model = graspd.load("small-session")
     pickled: graspd.GraspModel = pickle.loads(pickle.dumps(model))
@@ -79,7 +79,7 @@ def test_predict_proba_repairs_a_railed_electrode_as_judge_does(
     assert [None if np.isnan(each) else each for each in got[:, 1]] == expected
 
 
-def test_without_a_session_there_is_a_warning(counts: NDArray[np.float64]) -> None:
+def test_a_session_of_too_few_grasps_or_none_warns(counts: NDArray[np.float64]) -> None:
     model = graspd.load("small-session")
     with pytest.warns(UserWarning, match="Give session= 20 grasps or more"):
         model.predict_proba(counts[:1])
@@ -88,7 +88,9 @@ def test_without_a_session_there_is_a_warning(counts: NDArray[np.float64]) -> No
 
 
 @pytest.mark.parametrize("name", ["small-session", "cnn1"])
-def test_threads_share_a_model(name: str, counts: NDArray[np.float64]) -> None:
+def test_threads_that_share_a_model_get_the_same_results(
+    name: str, counts: NDArray[np.float64]
+) -> None:
     model = graspd.load(name)
     session = counts[:60] if name == "small-session" else None
     expected = model.predict_proba(counts, session=session)
@@ -145,7 +147,7 @@ assert not is_refused_in_a_child()
 """
 
 
-def test_a_fork_while_a_thread_judges_is_told_so() -> None:
+def test_judging_in_a_process_forked_while_judging_is_refused() -> None:
     subprocess.run([sys.executable, "-c", FORKS], check=True, timeout=60)
 
 
@@ -209,7 +211,7 @@ GIVEN: dict[str, Callable[[NDArray[np.float64]], Any]] = {
 
 
 @pytest.mark.parametrize("given", GIVEN.values(), ids=GIVEN)
-def test_whatever_holds_counts_is_judged_alike(
+def test_counts_in_any_container_get_the_same_probabilities(
     counts: NDArray[np.float64], given: Callable[[NDArray[np.float64]], Any]
 ) -> None:
     values = counts[:20].copy()
@@ -254,14 +256,14 @@ REFUSED: dict[str, tuple[Callable[[NDArray[np.float64]], Any], str]] = {
 
 
 @pytest.mark.parametrize(("given", "words"), REFUSED.values(), ids=REFUSED)
-def test_an_error_names_what_was_given(
+def test_invalid_counts_are_refused_with_the_reason(
     counts: NDArray[np.float64], given: Callable[[NDArray[np.float64]], Any], words: str
 ) -> None:
     with pytest.raises(ValueError, match=words):
         graspd.load("mlp").predict_proba(given(counts))
 
 
-def test_it_predicts_what_scikit_learn_would(counts: NDArray[np.float64]) -> None:
+def test_predict_names_the_most_probable_class_or_unknown(counts: NDArray[np.float64]) -> None:
     model = graspd.load("mlp")
     counts = np.concatenate([counts, np.full((1, 3, 24), np.nan)])
     best = model.classes_[model.predict_proba(counts).argmax(axis=1)]
@@ -272,7 +274,7 @@ def test_it_predicts_what_scikit_learn_would(counts: NDArray[np.float64]) -> Non
     assert repr(model) == "<GraspModel mlp of ff, mf, th>"
 
 
-def test_a_pool_of_processes_can_raise_a_recording_error(tmp_path: Path) -> None:
+def test_a_pickled_recording_error_keeps_text_and_fields(tmp_path: Path) -> None:
     with pytest.raises(RecordingError) as raised:
         graspd.read_recording(tmp_path / "none.csv")
     again = pickle.loads(pickle.dumps(raised.value))
@@ -306,7 +308,7 @@ def examples() -> list[str]:
     return re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 
 
-def test_the_example_of_the_page_runs(
+def test_the_first_example_of_library_md_runs(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(ROOT)
@@ -319,12 +321,12 @@ def test_the_example_of_the_page_runs(
 
 @pytest.fixture(scope="module")
 def fonts() -> None:
-    """Matplotlib opens its fonts once, and keeps them open."""
+    """Let matplotlib open its fonts, which it keeps open, before the test."""
     pytest.importorskip("matplotlib", reason="needs the extra `report`")
     graspd.plot_grasp(np.full((3, 24), 2000)).savefig(io.BytesIO())
 
 
-def test_the_drawing_of_the_page_is_made(
+def test_the_plot_example_of_library_md_makes_an_image(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     tmp_path: Path,
@@ -346,7 +348,7 @@ def test_the_drawing_of_the_page_is_made(
         ("read_recording", "mcap", "record"),
     ],
 )
-def test_a_missing_extra_is_an_error_with_its_command(
+def test_a_missing_extra_raises_an_error_with_install_command(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, function: str, package: str, extra: str
 ) -> None:
     path = tmp_path / "run"

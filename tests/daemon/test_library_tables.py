@@ -86,7 +86,7 @@ def test_times_of_any_kind_give_the_same_verdicts(
         (lambda t_s: t_s.astype(int), "^the table, column t: .*read_as=table.*rate_hz="),
     ],
 )
-def test_times_that_mean_little_are_refused(
+def test_missing_or_too_coarse_times_are_refused(
     times: Callable[[NDArray[np.float64]], Any], words: str
 ) -> None:
     pytest.importorskip("pandas", reason="needs the extra `pandas`")
@@ -95,7 +95,7 @@ def test_times_that_mean_little_are_refused(
         list(graspd.judge(stream.assign(t=times(stream.t.to_numpy()))))
 
 
-def test_sweeps_without_times_are_never_grasps() -> None:
+def test_sweeps_without_times_are_refused_as_grasps() -> None:
     pytest.importorskip("pandas", reason="needs the extra `pandas`")
     sweeps = graspd.read_recording(DEMO_RECORDING)[:260].drop(columns="t")
     model = graspd.load("mlp")
@@ -108,7 +108,7 @@ def test_sweeps_without_times_are_never_grasps() -> None:
     assert len(model.predict(again, read_as="table")) == 2
 
 
-def test_rows_of_a_finger_each_are_not_grasps(counts: NDArray[np.float64]) -> None:
+def test_a_table_with_rows_of_different_fingers_is_refused(counts: NDArray[np.float64]) -> None:
     names = [f"ff_biotac_{place}" for place in range(1, 25)]
     table = dict(zip(names, counts[:2, 0].T, strict=True))
     of_one: Any = {**table, "finger": ["ff", "FF "]}
@@ -129,7 +129,7 @@ def test_rows_of_a_finger_each_are_not_grasps(counts: NDArray[np.float64]) -> No
         ([], "no recording was given"),
     ],
 )
-def test_other_things_than_recordings_are_refused(given: Any, words: str) -> None:  # noqa: ANN401
+def test_judge_takes_only_files_and_tables(given: Any, words: str) -> None:  # noqa: ANN401
     with pytest.raises(ValueError, match=words):
         list(graspd.judge(given))
 
