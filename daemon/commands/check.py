@@ -84,7 +84,7 @@ def _endpoints(wanted: scene.Scene) -> list[str]:
 
 
 def _taken(wanted: scene.Scene) -> Iterator[tuple[str, str]]:
-    """Yield key and name of each resource, but endpoints, that a running scene has for itself."""
+    """Yield key and name of each resource, except endpoints, that a running scene claims."""
     yield "hand.name", wanted.hand.name
     if wanted.keeps_session:
         yield "session.folder", os.path.realpath(wanted.session_path)

@@ -233,7 +233,7 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
 
 
 def _shows_table(args: argparse.Namespace, source: Source, parts: Parts) -> bool:
-    """Return True to print a table of two methods: for users, and grasps that have outcomes."""
+    """Return True if a table of two methods is printed: for grasps with outcomes, no `--json`."""
     fingers = parts.model.contract.fingers
     if args.json or args.verbose or not isinstance(source, Tables) or fingers != TABLE_FINGERS:
         return False

@@ -283,7 +283,7 @@ class Scene(Section):
 
     @property
     def ask_file_mode(self) -> int | None:
-        """Mode of the file of the socket for questions, without others; None: the umask decides."""
+        """Mode of the questions' socket file, with no rights for others; None: by the umask."""
         mode = self.publish.file_mode
         return None if mode is None else int(mode, 8) & ~OTHERS
 

@@ -24,7 +24,7 @@ from graspd.models.trust.learner import Learner, LearnerState, of_format_2
 from graspd.models.trust.risk import Permission, Risk, RiskLimits, RiskOutcomes, RiskState
 
 VERSION: Final = 3
-"""Format of a state. Format 2 held the learner's `at_told`, format 1 no residual."""
+"""Format of a state. Format 2 held the result of `Learner.at_told`, format 1 no residual."""
 MAX_BYTES: Final = 1 << 20
 """Largest uncompressed state, bytes; three fingers with no outcome known yet take 620 kB."""
 DIGEST_BYTES: Final = 32
@@ -133,7 +133,7 @@ class Trust:
     def sensors_exchanged(
         self, learned: LearnerState | None = None, proven: int = 0, budget: float | None = None
     ) -> None:
-        """Start again for new sensors. Raises `ValueError` for a `learned` of another model.
+        """Start learning again for new sensors. Raises `ValueError` if `learned` does not fit.
 
         `learned`: earlier learning on them; None: none. `proven`, `budget`: see `Exchanged`.
         """
