@@ -43,7 +43,8 @@ RECEIVE_BUFFER_BYTES: Final = 1 << 20
 DATAGRAM_BYTES_MAX: Final = 4096
 """Longest datagram of `udp_multicast` that is read, bytes, as in python-can."""
 QUIET_NS: Final = 2_000_000_000
-"""Longest time without a frame of socketcand, ns: python-can does not notice a lost server."""
+"""Longest silence of a socketcand server, ns; after it the bus is reopened, because python-can does
+not notice a lost server."""
 STAMPED_INTERFACES: Final = frozenset({"socketcan", "udp_multicast", "virtual"})
 """Interfaces of python-can whose stamps are the wall time of arrival on this computer."""
 
@@ -119,7 +120,8 @@ class CanBus:
                 port.close()
 
     def drain(self) -> list[Stamped]:
-        """Return the next frames, oldest first. Never raises; a broken bus sets `failure`."""
+        """Return the frames that wait, at most `FRAMES_PER_DRAIN`, oldest first. Never raises; a
+        broken bus sets `failure`."""
         frames: list[Stamped] = []
         self.more = False
         try:
@@ -198,7 +200,10 @@ class CanBus:
         return self._newest_ns
 
     def _arrived(self, stamp_s: float, since_ns: int) -> tuple[int, int]:
-        """Return the earliest and latest time at which a frame arrived, ns."""
+        """Return the earliest and latest time at which a frame can have arrived, ns.
+
+        `stamp_s`: its stamp, used for socketcand only. `since_ns`: when the bus was last empty.
+        """
         now_ns, before_s = self._clock(), self._stamp_s
         if not self._is_remote:
             return since_ns, now_ns
@@ -253,7 +258,7 @@ def _enlarge_buffer(descriptor: int) -> None:
 
 
 def _frame_of(message: can.Message) -> CanFrame | None:
-    """Return a classic frame; None for one of CAN FD."""
+    """Return a message of python-can as a frame; None for one of CAN FD."""
     if message.is_fd:
         return None
     flags = EXTENDED if message.is_extended_id else 0

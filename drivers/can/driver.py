@@ -23,7 +23,7 @@ POLL_NS: Final = 1_000_000
 """Time between reads of a bus without a descriptor, ns."""
 REST_MARGIN_NS: Final = 1_000_000
 REST_MAX_NS: Final = 15_000_000
-"""Longest rest, ns: a quarter of what the kernel's usual buffer holds.
+"""Longest time for which frames are left in the kernel, ns: a quarter of what its buffer holds.
 
 Waking for each frame costs more than the frame, so the loop rests until shortly before the reading
 should be complete.
@@ -83,7 +83,8 @@ class CanBridgeDriver(Opened):
         return self.stream.describe()
 
     def open(self) -> None:
-        """Try once to take the bus. Raises `DriverError` if no try can ever succeed."""
+        """Try once to open the bus; `read_ready` tries again. Raises `DriverError` if no try can
+        ever succeed."""
         self.close()
         self.stream = self._make_stream()
         self._bus.counters = self.counters
@@ -92,7 +93,7 @@ class CanBridgeDriver(Opened):
         self._try_to_open()
 
     def tap(self, sink: Callable[[list[Stamped]], None]) -> None:
-        """Pass all frames that arrive from now on to `sink` too."""
+        """Pass all frames that arrive from now on to `sink` too, instead of an earlier sink."""
         self._bus.tap = sink
 
     def close(self) -> None:

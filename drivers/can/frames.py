@@ -105,9 +105,9 @@ class CanCounters(DriverCounters):
     """Frames in which the controller reports trouble on the bus."""
     wrong_length_frames: int = 0
     unknown_commands: int = 0
-    """Frames with the right id whose first byte samples no channel."""
+    """Frames with the right id whose first byte is not a command that samples a channel."""
     malformed_frames: int = 0
-    """Records without a classic frame. A CAN FD frame comes from another device."""
+    """Received records that are not a classic frame, such as a CAN FD frame of another device."""
     controller_overflows: int = 0
     """Error frames that say that the controller's receive buffer overflowed."""
     kernel_drops: int = 0
@@ -154,7 +154,8 @@ def describe_error(frame: CanFrame) -> str:
 
 
 def encode_sample(channel: int, words: bytes) -> bytes:
-    """Return the data of a frame. Raises `ValueError` for an unknown channel."""
+    """Return the data of a frame: the command that samples `channel`, then the response `words`.
+    Raises `ValueError` for an unknown channel."""
     return bytes((sample_command(channel),)) + words
 
 

@@ -69,7 +69,8 @@ _TYPES: Final[dict[str, dict[str, Any]]] = {
 """Types of options that python-can does not declare."""
 _WRONG_ARGUMENT: Final = (TypeError, ValueError, OverflowError)
 _ARGUED: Final = frozenset({"gs_usb", "slcan", "socketcan", "socketcand", "udp_multicast"})
-"""Interfaces that raise `_WRONG_ARGUMENT` only for arguments. Others also do for absent devices."""
+"""Interfaces that raise `_WRONG_ARGUMENT` only for wrong arguments. Others also raise it for absent
+devices."""
 
 # python-can also raises what it logs, and socketcand logs each piece of a stream.
 logging.getLogger("can").setLevel(logging.CRITICAL)
@@ -116,7 +117,8 @@ def open_bus(interface: str, channel: str, **options: Any) -> can.BusABC:  # noq
 
 
 def _open_socketcand(channel: str, host: str, port: int, **options: Any) -> can.BusABC:  # noqa: ANN401
-    """Connect within `CONNECT_S`. python-can alone would wait for ever, or spin for ten seconds."""
+    """Connect, with `CONNECT_S` at most for each step. python-can alone would wait for ever, or
+    spin for ten seconds."""
     before_s = socket.getdefaulttimeout()
     socket.create_connection((host, port), CONNECT_S).close()
     socket.setdefaulttimeout(CONNECT_S)
@@ -151,7 +153,7 @@ def _refuse_channel(interface: str, channel: str) -> None:
 
 
 def _refuse_bitrate(interface: str, bitrate: int | None) -> None:
-    """Raise `ValueError` for a bit rate that is set elsewhere, or that the adapter lacks."""
+    """Raise `ValueError` for a bit rate that is missing, set elsewhere, or not the adapter's."""
     known = _BITRATES.get(interface)
     if interface == "socketcan" and bitrate is not None:
         raise ValueError("bit rates of socketcan are set by `ip link set CHANNEL type can bitrate`")
@@ -163,7 +165,8 @@ def _refuse_bitrate(interface: str, bitrate: int | None) -> None:
 
 
 def _refuse_options(interface: str, options: Options) -> None:
-    """Raise `ValueError` for options that are missing, unknown or of a wrong type."""
+    """Raise `ValueError` for options that are missing, unknown, of a wrong type, or whose value
+    `OWN_OPTIONS` fixes."""
     constructor = _constructor(interface)
     parameters = inspect.signature(constructor).parameters
     named = {name for name, each in parameters.items() if each.kind is not each.VAR_KEYWORD}
@@ -190,7 +193,7 @@ def _refuse_options(interface: str, options: Options) -> None:
 
 
 def _constructor(interface: str) -> Any:  # noqa: ANN401
-    """Return the function that takes an interface's arguments. Raises `ValueError`."""
+    """Return `__init__` of an interface's bus. Raises `ValueError` if it cannot be imported."""
     module, name = BACKENDS[interface]
     try:
         return inspect.unwrap(getattr(importlib.import_module(module), name).__init__)

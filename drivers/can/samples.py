@@ -25,7 +25,10 @@ _ALL: Final = (1 << ELECTRODES) - 1
 
 
 class Held(Enum):
-    """Content of a sample's place in the current sweep, or beyond it in the sweep before."""
+    """Words that a sample's place already has, compared with the sample's.
+
+    Up to the last place of the current sweep they are its own, beyond it those of the sweep before.
+    """
 
     NOTHING = auto()
     SAME = auto()
@@ -34,7 +37,7 @@ class Held(Enum):
 
 
 class Fate(Enum):
-    """Fate of a sample."""
+    """Treatment of a sample that arrived."""
 
     BEGINS = auto()
     """The sample ends the current sweep and begins another."""
@@ -42,16 +45,16 @@ class Fate(Enum):
     REORDERED = auto()
     """The sample takes its place, although a later one arrived before it."""
     COPY = auto()
-    """Dropped."""
+    """Dropped: its place has the same words."""
     LATE = auto()
-    """Dropped: the reading of its sweep was handed over."""
+    """Dropped: its own sweep is over."""
 
 
 def classify(place: int, last: int, timing: Timing, held: Held, *, is_over: bool) -> Fate:
     """Return the fate of a sample, by the table in `deploy/can/PROTOCOL.md`.
 
-    `last`: furthest place of the current sweep, -1 for none. `is_over`: True if the reading of the
-    current sweep was handed over.
+    `last`: furthest place, 0 to 23, of the current sweep, -1 for none. `is_over`: True if the
+    reading of the current sweep was handed over.
     """
     if timing is Timing.LATE or last - place > REORDER_MAX:
         return Fate.BEGINS
@@ -142,7 +145,8 @@ class SampleAssembler:
         """Add a sample; return the readings that it completes, oldest first.
 
         `words`: response word of each sensor, two bytes each. The sample arrived at `t_ns`, or
-        between `t_ns` and `until_ns` if that is given; too wide a range makes it useless.
+        between `t_ns` and `until_ns` if that is given. If that range is too wide to tell its sweep,
+        the sample is dropped.
         """
         place = self._place.get(channel)
         if place is None:
@@ -182,7 +186,8 @@ class SampleAssembler:
         return ()
 
     def cut(self) -> Sequence[TactileReading]:
-        """End the current sweep. Call when an unknown number of samples was lost."""
+        """End the current sweep and return its reading, if it has one that was not returned yet.
+        Call when an unknown number of samples was lost."""
         self._counters.cut_sweeps += not self._sweep.is_over and self._sweep.have != 0
         self._clock.cut()
         self._synchronised = False

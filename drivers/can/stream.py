@@ -41,7 +41,7 @@ _SPECIAL: Final = ERROR | REMOTE | LOST
 
 
 READINGS_MIN: Final = 20
-"""Fewest readings by which the board's sequence is known."""
+"""Number of readings from which on the board's sequence is compared with the configured one."""
 
 
 class BoardOptions(TypedDict, total=False):
@@ -70,7 +70,7 @@ class CanStream:
         sequence: str = "interleaved",
         data_length: int | None = None,
     ) -> None:
-        """`bus`: its name in messages. Raises `ValueError` for options that do not fit.
+        """`bus`: name of the bus in messages. Raises `ValueError` for options that do not fit.
 
         `fingers`: the rows of a reading. `sensors`: the fingers in the order of the board's words,
         three at most; None: `fingers`. `arbitration_id`: above 0x7FF it has 29 bits. None: take the
@@ -119,7 +119,8 @@ class CanStream:
         return facts
 
     def _has_sequence(self) -> bool:
-        """Return False if samples of other channels are below 1/4 or above 4 times the expected."""
+        """Return False if samples of channels that are not electrodes are below 1/4 or above 4
+        times the number that the sequence has; True before `READINGS_MIN`."""
         counters, expected = self.counters, len(SEQUENCES[self._sequence]) - ELECTRODES
         readings = counters.readings
         others = counters.accepted_frames - ELECTRODES * readings + counters.lost_frames
@@ -158,13 +159,13 @@ class CanStream:
             self.link.greeting()
 
     def lost(self, error: LinkError, now_ns: int) -> None:
-        """Call when the bus broke or could not be opened."""
+        """Drop the current sweep and set the link down. Call when the bus broke or did not open."""
         self.counters.bus_faults += 1
         self.last_error = str(error)
         self._down(error, now_ns)
 
     def interrupt(self) -> None:
-        """Drop the current sweep. Another board may come next."""
+        """Drop the current sweep and an arbitration id that was learned: the board may change."""
         self._sweeps.interrupt()
         self.arbitration_id = self._configured_id
 

@@ -25,7 +25,8 @@ SLOT_MIN_NS: Final = 100_000
 ARRIVAL_JITTER_NS: Final = 5_000_000
 """Delay of a sweep, ns, up to which no sweep counts as missed."""
 EVEN_SHARE: Final = 1 / 3
-"""Largest gap of samples without a lost sweep, in periods. A lost sweep makes one of half."""
+"""Share of the time between the ends of two sweeps. If no gap between samples is as long, no sweep
+was lost between them; a lost one makes a gap of at least half."""
 PERIODS_KEPT: Final = 15
 PERIODS_NEEDED: Final = 5
 """Number of measured periods after which the period is known, as the median of the last 15."""
@@ -45,7 +46,7 @@ class SweepClock:
     """Times of the sweeps of one board; `period_ns` is None until it is known."""
 
     def __init__(self, slots: Sequence[int], samples: int) -> None:
-        """`slots`: slot of each place in a sweep of `samples` slots, rising."""
+        """`samples`: number of samples of a sweep. `slots`: index of each electrode's, rising."""
         self.period_ns: int | None = None
         self.t_ns = 0
         """Time of the last sample of the current sweep."""
@@ -79,7 +80,7 @@ class SweepClock:
         """Number of samples in a row without a gap in their order."""
 
     def follow(self, place: int, t_ns: int) -> bool:
-        """Note any sample; return True if its place shows that a sweep began since the last one."""
+        """Note any sample; return True if its place shows a new sweep since the sample before."""
         begins = place == 0 or place < self._seen
         if place != self._seen:
             follows = place == (self._seen + 1) % ELECTRODES
@@ -98,7 +99,7 @@ class SweepClock:
     def timing(self, place: int, last: int, until_ns: int) -> Timing:
         """Compare a sample with the current sweep; `last`: its furthest place.
 
-        A sweep without a sample (-1) takes any: it does not matter what this returns.
+        For a sweep without a sample (`last` is -1) the result does not matter.
         """
         if self.period_ns is None:
             late_ns: float = until_ns - self.t_ns - max(place - last, 0) * SLOT_MIN_NS

@@ -21,17 +21,17 @@ from tests.drivers.can.can_words import pack_frame, samples
 
 CHANNELS = itertools.count()
 LOOPBACK = "lo"
-"""The driver looks for the interface before python-can does; this one is always there."""
+"""Network interface that every computer has; the driver looks for it before python-can does."""
 
 
 class SocketBus:
-    """What python-can's `socketcan` bus is to the driver: something with a raw socket.
+    """Stand-in for python-can's `socketcan` bus, of which the driver uses the raw socket.
 
     The socket is one end of a pair of Unix datagram sockets.
     """
 
     def __init__(self, *, stamped: bool = False) -> None:
-        """`stamped`: like a CAN socket. Else no pause of a busy computer is between two frames."""
+        """`stamped`: the kernel stamps frames, as of CAN. Else those of one read have one time."""
         self.socket, self.far_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
         self.socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, stamped)
         self.far_end.setblocking(False)
@@ -91,7 +91,7 @@ Opener = Callable[[], object]
 
 
 def stand_in(monkeypatch: pytest.MonkeyPatch, opener: Opener) -> None:
-    """Have python-can open what `opener` returns or raises."""
+    """Replace python-can's `Bus` by a function that returns or raises what `opener` does."""
 
     def open_bus(**_: object) -> object:
         return opener()

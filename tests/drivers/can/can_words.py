@@ -25,14 +25,14 @@ ELECTRODE_CHANNELS = range(E1, E1 + 24)
 
 
 def word(count: int) -> bytes:
-    """`D11..D5 P  D4..D0 0 0 P`, odd parity."""
+    """Response word of a count: `D11..D5 P  D4..D0 0 0 P`, odd parity."""
     bits = f"{count:012b}"
     high, low = bits[:7], bits[7:] + "00"
     return bytes(int(part + str((part.count("1") + 1) % 2), 2) for part in (high, low))
 
 
 def words_of(counts: NDArray[np.uint16], channel: int) -> bytes:
-    """Words of all fingers for one electrode, or of a channel that is none."""
+    """Words of all fingers for an electrode; for another channel words of the count 2050."""
     if channel not in ELECTRODE_CHANNELS:
         return word(2050) * len(counts)
     return b"".join(word(int(count)) for count in counts[:, channel - E1])
@@ -67,7 +67,7 @@ def feed(sweeps: SampleAssembler, stream: Iterable[Sample]) -> list[TactileReadi
 
 
 def pack_frame(frame: CanFrame) -> bytes:
-    """The struct that Linux would hand over."""
+    """The `can_frame` that Linux would hand over."""
     word = frame.arbitration_id
     word |= EFF_FLAG if frame.flags & EXTENDED else 0
     word |= RTR_FLAG if frame.flags & REMOTE else 0

@@ -1,4 +1,4 @@
-"""Bytes of CAN frames: golden vectors, the DBC file, which are taken, and options refused."""
+"""Bytes of CAN frames, the DBC file, which frames are decoded, and which options are refused."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ def test_an_id_that_was_learned_is_forgotten_with_the_link(configured: int | Non
     assert counters.foreign_frames == (configured is not None)
 
 
-def test_a_board_that_pads_frames_needs_its_option() -> None:
+def test_padded_frames_are_decoded_with_data_length_set() -> None:
     made, counters = decoder(data_length=8)
     readings: list[TactileReading] = []
     for at, words, t_ns in samples(0):
@@ -182,7 +182,7 @@ def test_a_board_that_pads_frames_needs_its_option() -> None:
     assert counters.faulty_readings == 0
 
 
-def test_words_that_are_not_counts_are_told_apart() -> None:
+def test_words_that_are_not_counts_are_flagged_by_kind() -> None:
     made, counters = decoder()
     frames = sweep_of_frames(0)
     frames[0] = CanFrame(SAMPLE_ID, E1_SAMPLE[:1] + bytes.fromhex("A250 A52D FFFF"))
@@ -193,7 +193,9 @@ def test_words_that_are_not_counts_are_told_apart() -> None:
 
 @pytest.mark.parametrize("scene", ["all", "interleaved"])
 @pytest.mark.parametrize("board", sorted(SEQUENCES))
-def test_another_sequence_shows_after_twenty_readings(scene: str, board: str) -> None:
+def test_a_sequence_unlike_the_scenes_is_reported_after_twenty_readings(
+    scene: str, board: str
+) -> None:
     made = CanStream("bus", ("ff", "mf", "th"), arbitration_id=SAMPLE_ID, sequence=scene)
     for sweep in range(20):
         assert "sequence" not in made.describe()
@@ -208,7 +210,7 @@ ORDER = ("th", "ff", "mf")
 
 
 @pytest.mark.parametrize("fingers", [("ff", "mf", "th"), ("mf", "th")])
-def test_rows_are_fingers_and_words_are_sensors(fingers: Sequence[str]) -> None:
+def test_words_in_sensor_order_fill_rows_in_finger_order(fingers: Sequence[str]) -> None:
     made = CanStream("bus", fingers, sensors=ORDER, arbitration_id=SAMPLE_ID, sequence="electrodes")
     readings: list[TactileReading] = []
     for at, words, t_ns in (*samples(0), *samples(1)):
@@ -224,7 +226,9 @@ def test_rows_are_fingers_and_words_are_sensors(fingers: Sequence[str]) -> None:
     ("sensors", "says"),
     [(("ff", "mf"), "not in"), (("ff", "mf", "th", "rf"), "9 bytes cannot carry 4 sensors")],
 )
-def test_sensors_that_cannot_be_are_refused(sensors: Sequence[str], says: str) -> None:
+def test_sensors_without_a_finger_or_too_many_are_refused(
+    sensors: Sequence[str], says: str
+) -> None:
     with pytest.raises(ValueError, match=says):
         CanStream("bus", ("ff", "mf", "th"), sensors=sensors)
 
@@ -308,7 +312,7 @@ def test_frames_that_are_not_ours_are_counted_and_harm_nothing() -> None:
         ("socketcan", {"bitrate": 1_000_000}, "ip link set"),
     ],
 )
-def test_arguments_that_can_never_be_are_refused(
+def test_arguments_that_can_never_work_are_refused(
     interface: str, options: Mapping[str, Any], says: str
 ) -> None:
     with pytest.raises(ValueError, match=says):

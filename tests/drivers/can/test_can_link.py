@@ -1,4 +1,4 @@
-"""Buses that fail, come back, have a socket, a terminal or nothing: the CAN bridge keeps up."""
+"""The CAN driver's link: buses that fail, fall silent or come back, stamps, a socketcand server."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def test_the_link_recovers_from_any_error_of_python_can(
     assert second.shut_down == 1
 
 
-def test_one_call_takes_a_bounded_number_of_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_read_takes_512_frames_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = Clock()
     bus = ScriptedBus([message(b"\0", 0x7FF)] * (2 * FRAMES_PER_DRAIN + 5))
     stand_in(monkeypatch, lambda: bus)
@@ -128,8 +128,8 @@ def test_python_can_gets_bit_rate_and_bounded_queue(
     assert seen["ignore_config"] is True
 
 
-def test_a_wrong_argument_is_final_where_it_means_that(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Other interfaces of python-can raise the same for a device that is absent."""
+def test_a_value_error_ends_slcan_but_robotell_is_retried(monkeypatch: pytest.MonkeyPatch) -> None:
+    """slcan raises `ValueError` only for a wrong argument, robotell also for an absent device."""
     stand_in(monkeypatch, lambda: int("no number"))
     with pytest.raises(DriverError, match="cannot open slcan x: invalid literal"):
         CanBridgeDriver("slcan", "x").open()
@@ -138,7 +138,7 @@ def test_a_wrong_argument_is_final_where_it_means_that(monkeypatch: pytest.Monke
 
 
 def test_a_silent_board_is_down_and_comes_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No error tells of it: the bus is there, others even talk on it."""
+    """No error shows it: the bus works, and other devices send on it."""
     bus, clock = ScriptedBus(), Clock()
     stand_in(monkeypatch, lambda: bus)
     foreign = message(bytes(7), 0x7FF)
@@ -170,7 +170,7 @@ def test_a_silent_board_is_down_and_comes_back(monkeypatch: pytest.MonkeyPatch) 
 def test_a_frame_is_as_old_as_its_stamp(
     monkeypatch: pytest.MonkeyPatch, stamp_s: float, age_ns: int
 ) -> None:
-    """A stamp after now is of a wall clock that was set back meanwhile."""
+    """A stamp after now comes from a wall clock that was set back since, and counts as now."""
     received = message(b"\0", 0x7FF)
     received.timestamp = stamp_s
     stand_in(monkeypatch, lambda: ScriptedBus([received]))
@@ -202,7 +202,7 @@ def test_frames_stay_in_order_if_clocks_are_read_late(
     bus.close()
 
 
-def test_an_unstamped_frame_came_since_the_bus_was_empty(
+def test_an_unstamped_frame_arrived_since_the_bus_was_last_empty(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     scripted, clock = ScriptedBus(), Clock(1_000)
@@ -254,7 +254,7 @@ def serve(listener: socket.socket, texts: queue.Queue[str], clients: int) -> Non
 
 
 def next_reading(driver: CanBridgeDriver) -> TactileReading:
-    """Read until a reading comes; the clock stands."""
+    """Read until a reading comes, and return it; the driver's clock stands still."""
     end_s = time.monotonic() + LIMIT_S
     while not (found := tactile(driver.read_ready())):
         assert time.monotonic() < end_s, "no reading came"
@@ -262,7 +262,7 @@ def next_reading(driver: CanBridgeDriver) -> TactileReading:
     return reading
 
 
-def test_a_server_is_read_and_connected_to_again() -> None:
+def test_a_socketcand_server_silent_for_2_s_is_reconnected() -> None:
     """python-can reads nothing for ever from a connection that was closed."""
     clock = Clock()
     with socket.create_server(("127.0.0.1", 0)) as listener:

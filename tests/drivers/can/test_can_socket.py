@@ -122,10 +122,10 @@ def test_records_that_are_not_frames_are_counted(socket_bus: SocketBus) -> None:
         assert driver.counters.malformed_frames == 4
 
 
-def test_frames_that_the_kernel_dropped_cut_the_sweep_there(
+def test_frames_dropped_by_the_kernel_cut_the_sweep_there(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A board whose samples bear one id; exactly whole sweeps may be lost: time does not help."""
+    """Time does not show the loss: the clock stands still, and whole sweeps may be lost."""
     clock = Clock()
     bus = ScriptedBus()
     with (
@@ -153,7 +153,7 @@ def test_frames_that_the_kernel_dropped_cut_the_sweep_there(
         assert (readings[-1].counts == counts_of(21)).all()
 
 
-def test_the_loop_rests_fifteen_milliseconds_at_most(
+def test_frames_wait_in_the_kernel_for_15_ms_at_most(
     socket_bus: SocketBus,
 ) -> None:
     clock = Clock()
@@ -172,7 +172,7 @@ def test_the_loop_rests_fifteen_milliseconds_at_most(
     assert rests == {at: min(ms - 1, 15) if ms > 1 else None for at, ms in left.items()}
 
 
-def test_real_socketcan_plays_count_for_count() -> None:
+def test_counts_pass_through_real_socketcan_unchanged() -> None:
     """Needs a kernel with CAN: `ip link add dev vcan0 type vcan; ip link set vcan0 up`."""
     try:
         socket.if_nametoindex("vcan0")
@@ -192,10 +192,10 @@ def test_real_socketcan_plays_count_for_count() -> None:
         assert (reading.counts == expected).all()
 
 
-def test_an_adapters_own_words_hide_no_frames_behind_them(
+def test_a_frame_behind_an_slcan_adapters_answer_is_read(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """python-can returns nothing for them although frames are behind them."""
+    """python-can's `recv` returns None for such an answer, although frames wait behind it."""
     sleep, slept_s = time.sleep, [0.0]
 
     def noted(seconds: float) -> None:

@@ -40,8 +40,8 @@ def missing_electrodes(reading: TactileReading) -> list[int]:
 
 @pytest.mark.parametrize("distance", [1, 2, 3])
 @pytest.mark.parametrize("at", [0, 20, 23])
-def test_a_late_sample_is_put_in_its_place_or_flagged(at: int, distance: int) -> None:
-    """A sample comes up to three after its place; behind the last electrode it is too late."""
+def test_a_late_sample_is_placed_unless_its_sweep_has_ended(at: int, distance: int) -> None:
+    """A sample comes one to three places late; after the last electrode's it is too late."""
     sweeps, counters = assembler()
     stream = concatenated([samples(n) for n in range(9)])
     here = 6 * 24 + at
@@ -86,18 +86,18 @@ def periods(gaps_ns: Sequence[int]) -> list[int | None]:
     return known
 
 
-def test_a_period_is_the_median_of_five_to_fifteen() -> None:
+def test_the_period_is_the_median_of_five_to_fifteen_gaps() -> None:
     assert periods([10] * 15 + [20] * 9) == [None] * 4 + [10] * 11 + [10] * 7 + [20] * 2
 
 
-def test_a_period_is_two_seconds_at_most() -> None:
+def test_only_gaps_up_to_two_seconds_teach_a_period() -> None:
     for gap_ns in (0, -1, 2_000 * MS + 1):
         assert periods([gap_ns] * 5) == [None] * 5
     assert periods([2_000 * MS] * 5)[-1] == 2_000 * MS
 
 
 def missed_when_late(number: int, late_ns: int) -> int:
-    """Sweeps said to be missed when after `number` of them all samples come so late."""
+    """Number of sweeps counted as missed if all samples from sweep `number` on are late."""
     made, counters = assembler()
     for sweep in range(number + 2):
         for channel, words, t_ns in samples(sweep):
@@ -123,7 +123,7 @@ def test_a_late_sweep_tells_how_many_were_missed(number: int, late_ns: int, miss
 @pytest.mark.parametrize(
     ("doubt_ns", "untimed"), [(round(0.75 * PERIOD_NS) - 1, 0), (round(0.75 * PERIOD_NS), 1)]
 )
-def test_a_sample_vague_by_three_quarters_is_dropped(doubt_ns: int, untimed: int) -> None:
+def test_a_sample_vague_by_three_quarters_period_is_dropped(doubt_ns: int, untimed: int) -> None:
     made, counters = assembler()
     for sample in concatenated([samples(n) for n in range(9)]):
         made.push(*sample)
@@ -133,7 +133,7 @@ def test_a_sample_vague_by_three_quarters_is_dropped(doubt_ns: int, untimed: int
 
 
 @pytest.mark.parametrize("lost", [23, 24, 47])
-def test_repeated_words_make_no_copies_of_lost_samples(lost: int) -> None:
+def test_losses_are_counted_exactly_if_all_sweeps_have_equal_words(lost: int) -> None:
     """The words of all sweeps are the same, so only time tells that a sample is not a copy."""
     sweeps, counters = assembler()
     stream = concatenated([samples(n) for n in range(20)])
@@ -155,7 +155,9 @@ def test_repeated_words_make_no_copies_of_lost_samples(lost: int) -> None:
         (9, 2_300_000, True),
     ],
 )
-def test_an_unknown_period_is_the_fastest_boards(place: int, after_ns: int, is_next: bool) -> None:
+def test_an_unknown_period_counts_as_that_of_the_fastest_board(
+    place: int, after_ns: int, is_next: bool
+) -> None:
     """100 us a sample: three quarters of a sweep are 1800 us, after the time to that place."""
     sweeps, _ = assembler()
     begun, late = samples(0)[:5], samples(0)[place]
@@ -164,8 +166,8 @@ def test_an_unknown_period_is_the_fastest_boards(place: int, after_ns: int, is_n
 
 
 @pytest.mark.parametrize("kept", [0, 10])
-def test_two_ends_in_succession_teach_the_period(kept: int) -> None:
-    """Every second sweep is lost, or has no end: too few lost samples to look like a pause."""
+def test_the_period_stays_if_every_second_sweep_loses_its_end(kept: int) -> None:
+    """From the ninth on, every second sweep is lost, whole or after its tenth sample."""
     sweeps, _ = assembler()
     stream = [samples(n) if n < 8 or n % 2 else samples(n)[:kept] for n in range(50)]
     feed(sweeps, concatenated(stream))
@@ -177,7 +179,7 @@ def test_two_ends_in_succession_teach_the_period(kept: int) -> None:
 
 @pytest.mark.parametrize("sequence", sorted(SEQUENCES))
 @pytest.mark.parametrize("rate_hz", [1, 400])
-def test_slow_and_fast_boards_are_understood(sequence: str, rate_hz: int) -> None:
+def test_the_period_of_slow_and_fast_boards_is_learned(sequence: str, rate_hz: int) -> None:
     """Nothing is known of the rate when the driver opens."""
     sweeps, _ = assembler(sequence)
     slot_ns = round(1e9 / rate_hz / len(SEQUENCES[sequence]))
@@ -197,7 +199,7 @@ def test_slow_and_fast_boards_are_understood(sequence: str, rate_hz: int) -> Non
         (9, SLOT_NS, 3 * SLOT_NS, 1),
     ],
 )
-def test_a_jump_to_the_end_is_dropped_if_early(
+def test_a_skip_to_the_last_places_is_dropped_if_early(
     sweep: int, step_ns: int, t_ns: int, late: int
 ) -> None:
     sweeps, counters = assembler()
@@ -208,7 +210,7 @@ def test_a_jump_to_the_end_is_dropped_if_early(
     assert counters.late_frames == late
 
 
-def test_vague_times_teach_a_period_after_five_sweeps() -> None:
+def test_vague_times_teach_a_period_after_six_sweeps() -> None:
     sweeps, counters = assembler()
     for channel, words, t_ns in concatenated([samples(n) for n in range(20)]):
         sweeps.push(channel, words, t_ns - 3 * MS, t_ns)
@@ -237,7 +239,7 @@ def retimed(stream: Sequence[Sample], times_ns: Sequence[int]) -> list[Sample]:
 
 @pytest.mark.parametrize("sequence", sorted(SEQUENCES))
 def test_a_host_that_stalls_leaves_no_wrong_period_behind(sequence: str) -> None:
-    """Half a second of samples that come late and in heaps, as from a computer without a break."""
+    """For half a second samples come late and many at once, as on a busy computer."""
     chance = random.Random(0)
     sweeps, _ = assembler(sequence)
     count = 5000 // len(SEQUENCES[sequence])
@@ -261,7 +263,7 @@ PLACES: dict[str, Callable[[int, int], bool]] = {
     "far back": lambda place, last: place < last - 3,
     "jump": lambda place, last: place in (21, 22, 23) and last in (0, 1, 2),
 }
-"""Words of the page, as it says below the table; places and the furthest one from 0."""
+"""Meaning of the page's words for a sample's place, given that place and the furthest, from 0."""
 OUT = ", reading has ended"
 TIMES = {"any": set(Timing), "late": {Timing.LATE}, "early": {Timing.EARLY}}
 HELD = {
@@ -284,7 +286,7 @@ def rows() -> list[list[str]]:
     return [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines()[2:]]
 
 
-def test_the_first_row_of_the_page_that_fits_decides() -> None:
+def test_classify_follows_the_first_matching_row_of_the_protocols_table() -> None:
     used, table = set(), rows()
     for place, last, timing, held, is_over in itertools.product(
         range(24), range(-1, 24), Timing, Held, (False, True)
