@@ -155,7 +155,8 @@ _LOW_RAD, _HIGH_RAD = (
 
 
 def impossible_angles(position_rad: NDArray[np.float64]) -> int:
-    """Return the number of angles of `JOINTS` that are far out of range; NaN does not count."""
+    """Return how many angles, in the order of `JOINTS`, are more than `RANGE_MARGIN_DEG` out of
+    their range; NaN does not count."""
     return int(((position_rad < _LOW_RAD) | (position_rad > _HIGH_RAD)).sum())
 
 
@@ -207,7 +208,7 @@ def load_calibration(path: Path) -> JointCalibration:
 
 
 def parse_calibration(data: Mapping[str, Any], path: Path) -> JointCalibration:
-    """Check the content of a file. Raises `CalibrationError`."""
+    """Check and convert the content of a file. Raises `CalibrationError`, which names `path`."""
     problems = list(_problems(data))
     if problems:
         raise CalibrationError(path, problems)

@@ -38,7 +38,7 @@ TYPE_METADATA_LAST: Final = 0xFFFF
 """Last `tactile_type` whose `tactile` has serial numbers and versions instead of samples."""
 
 VALID_OTHER_0, VALID_OTHER_1 = 4, 8
-"""Bits of `TactileSlot.valid` for `other_0` and `other_1`; bits 1 and 2 are for PAC words."""
+"""Masks of `TactileSlot.valid` for `other_0` and `other_1`; masks 1 and 2 are for PAC words."""
 VALID_ALL = 0x0F
 
 
@@ -148,7 +148,8 @@ class PalmCounters(DatagramCounters):
     invalid_fingers: int = 0
     """Slots that the palm marked as not valid."""
     absent_fingers: int = 0
-    """Fingers without a sensor: no counts, or only zeros. Each counts once in each round."""
+    """Fingers without a sensor: pressure or temperature over 4095, or all electrodes 0. Each counts
+    once in each round."""
     joint_readings: int = 0
     bad_angles: int = 0
     """Angles of calibrated joints handed over as NaN, because the raw value is not a count."""
@@ -186,7 +187,8 @@ class _Layout(NamedTuple):
 
 
 def _layout(slot_bytes: int, *, motors_first: bool, middle: str = "", after: str = "") -> _Layout:
-    """Return the layout of a palm; `middle`, `after`: padding around the tactile block."""
+    """Return the layout of a palm. `slot_bytes`: length of a finger's tactile slot. `middle`,
+    `after`: formats of `struct` for the padding before and after the tactile block."""
     motors = f"4xh{MOTOR_BYTES}x"
     slot = f"HHHBxH{slot_bytes - 10}x"
     tactile = f"{middle}IH{slot * TACTILE_FINGERS}{after}"

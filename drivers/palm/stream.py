@@ -126,7 +126,8 @@ class PalmStream:
         return 0 if self._place is None else (ROUND - 1 - self._place) % ROUND
 
     def receive(self, data: bytes, t_ns: int) -> Sequence[Reading] | None:
-        """Return the readings that a packet completes; None if the packet is dropped."""
+        """Return the readings that a packet completes; None if it comes again, is of another kind
+        of palm, or is not a packet with sensor data."""
         packet = parse_packet(data, self.counters)
         if packet is None:
             return None
@@ -151,7 +152,7 @@ class PalmStream:
         self._known[:] = False
 
     def push(self, packet: PalmPacket, t_ns: int) -> Sequence[TactileReading]:
-        """Add a packet of `t_ns`; return the tactile readings that it completes."""
+        """Add a packet that arrived at `t_ns`; return the tactile readings that it completes."""
         position = position_of(packet.tactile_type)
         if position is None:
             is_metadata = TYPE_METADATA_FIRST <= packet.tactile_type <= TYPE_METADATA_LAST
@@ -180,7 +181,7 @@ class PalmStream:
         return (*finished, self._finish()) if self._have == _COMPLETE else finished
 
     def _is_duplicate(self, packet: PalmPacket, position: int, t_ns: int) -> bool:
-        """Return True for a packet that came before; one of a later round may equal it too."""
+        """Return True for a copy of a packet of this round, False for its like in the next one."""
         if self.packets[position] != packet or self._place is None or self._place_t_ns is None:
             return False
         elapsed_ns = t_ns - self._place_t_ns
@@ -276,7 +277,7 @@ class PalmStream:
         return TactileReading(self._t_ns, self._round, counts, faults, interrupted=interrupted)
 
     def _drop_absent_fingers(self) -> None:
-        """Flag fingers without a sensor: their words are unwritten memory, no counts or zeros."""
+        """Flag fingers without a sensor: their words are unwritten memory, over 4095 or all 0."""
         silent: NDArray[np.bool_] = ((self._counts == 0) & (self._faults == 0)).all(axis=1)
         absent = np.array(self._absent)
         if self._have & _TELLING != _TELLING:
@@ -353,7 +354,10 @@ class PalmDriver(DatagramDriver[PalmStream]):
 
 
 def _step(place: int, position: int, elapsed_ns: int) -> int:
-    """Return the distance from the furthest packet to this one; 0 or less if it is late."""
+    """Return by how many places a packet of `position` is after the furthest, which is at `place`.
+
+    0 or less: it is late. `elapsed_ns`: time since the furthest packet.
+    """
     step = (position - place) % ROUND or ROUND
     if step > ROUND // 2 and elapsed_ns < step * CYCLE_NS // 2:
         return step - ROUND

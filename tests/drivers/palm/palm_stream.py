@@ -20,14 +20,14 @@ ROUND = 14
 
 @dataclass
 class Played:
-    """What came out of a stream."""
+    """Readings that a stream returned, and its counters."""
 
     counters: PalmCounters
     readings: list[TactileReading] = field(default_factory=list)
 
 
 def play(cycles: Iterable[Sequence[bytes]], fingers: Sequence[str] = FINGERS) -> Played:
-    """Datagrams by the millisecond through a stream, as the driver does it."""
+    """Pass the datagrams of each millisecond through a new stream, as the driver does."""
     stream = PalmStream(fingers)
     played = Played(stream.counters)
     for cycle, datagrams in enumerate(cycles):
@@ -37,7 +37,7 @@ def play(cycles: Iterable[Sequence[bytes]], fingers: Sequence[str] = FINGERS) ->
 
 
 def packets(number: int) -> list[PalmPacket]:
-    """Packets of rounds of `sweeps_of`."""
+    """Packets of `number` rounds, with the counts of `sweeps_of`."""
     return list(PalmTwin(sweeps_of(number)).packets())
 
 
@@ -46,7 +46,7 @@ def datagrams(rounds: int, palm: Palm = Palm.PALM_0220) -> list[bytes]:
 
 
 def play_packets(stream: Iterable[PalmPacket | None]) -> Played:
-    """One packet per millisecond; None is one that does not come."""
+    """Pass one packet per millisecond through a new stream; None: a packet is lost."""
     return play([] if packet is None else [packet.to_bytes()] for packet in stream)
 
 

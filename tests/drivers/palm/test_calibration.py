@@ -35,7 +35,7 @@ FILE = Path("hand.toml")
 
 
 def degrees(calibration: JointCalibration, **raws: int | tuple[int, ...]) -> dict[str, float]:
-    """Angles, degrees, with the words of the given joints; THJ5 and WRJ1 take two."""
+    """Angles of all joints, degrees, for raw values of the given ones; THJ5 and WRJ1 take two."""
     words = {"FFJ1": 0, "FFJ2": 1, "FFJ3": 2, "FFJ4": 3, "LFJ5": 16, "THJ1": 17, "THJ2": 18,
              "THJ4": 20, "THJ5": 21, "WRJ1": 23, "WRJ2": 25}  # fmt: skip
     sensors = [1] * 37
@@ -71,7 +71,7 @@ def problems(data: dict[str, object]) -> tuple[str, ...]:
         ("THJ5", (4029, 1668), -60 + 120 * (3633 - 2848.5) / 2570),
     ],
 )
-def test_the_values_of_a_real_hand_are_met(
+def test_angles_of_the_example_file_are_interpolated_and_extended(
     joint: str, raw: int | tuple[int, int], expected_deg: float
 ) -> None:
     assert degrees(load_calibration(EXAMPLE), **{joint: raw})[joint] == pytest.approx(expected_deg)
@@ -115,7 +115,7 @@ RANGES_DEG = {
 }
 
 
-def test_an_angle_ten_degrees_beyond_its_range_is_impossible() -> None:
+def test_an_angle_over_ten_degrees_beyond_range_is_impossible() -> None:
     assert set(JOINTS) == set(RANGES_DEG)
     for joint, (low, high) in RANGES_DEG.items():
         for angle, impossible in (
@@ -173,7 +173,7 @@ REFUSED = [
 ]
 
 
-def test_a_table_at_its_limits_is_taken() -> None:
+def test_a_table_at_its_limits_is_accepted() -> None:
     for data in TAKEN:
         parse_calibration(data, FILE)
 
@@ -206,7 +206,7 @@ GRID = [
 
 
 def test_a_square_grid_agrees_with_an_independent_interpolation() -> None:
-    """The reference cuts squares in the plane that the table's documentation names."""
+    """By the table's `SHEAR` of the raw pairs, the reference cuts the same triangles."""
     interpolate = pytest.importorskip("scipy.interpolate", reason="scipy is not installed")
     rows, sheared = np.array(GRID), np.array([[1.0, 1e-5], [0.0, 1.00001618]])
     reference = interpolate.LinearNDInterpolator(rows[:, :2] @ sheared, rows[:, 2:])
@@ -238,7 +238,9 @@ def test_a_square_grid_agrees_with_an_independent_interpolation() -> None:
         ("FFJ1", 7, "must be a list of points"),
     ],
 )
-def test_a_wrong_table_is_refused_by_name(joint: str, rows: object, reason: str) -> None:
+def test_a_wrong_table_is_refused_with_joint_and_reason(
+    joint: str, rows: object, reason: str
+) -> None:
     found = problems({"version": 1, "joints": {joint: rows, "FFJ4": [[591, -20], [1884, 0]]}})
     assert any(line.startswith(f"{joint}: ") and reason in line for line in found), found
 
@@ -271,7 +273,7 @@ def test_a_wrong_file_is_refused_with_the_reason(data: dict[str, object], reason
         (None, "cannot be read"),
     ],
 )
-def test_an_unreadable_file_is_refused_by_its_path(
+def test_an_unreadable_file_is_refused_with_path_and_reason(
     tmp_path: Path, content: bytes | None, reason: str
 ) -> None:
     path = tmp_path / "hand.toml"
@@ -281,7 +283,7 @@ def test_an_unreadable_file_is_refused_by_its_path(
         load_calibration(path)
 
 
-def test_a_file_has_at_most_256_kilobytes(tmp_path: Path) -> None:
+def test_a_file_of_256_kib_is_accepted(tmp_path: Path) -> None:
     path = tmp_path / "hand.toml"
     path.write_text(EXAMPLE.read_text().ljust(262_144, "#"))
     assert load_calibration(path).tables
@@ -299,7 +301,7 @@ values = st.recursive(
 
 @settings(max_examples=40)
 @given(st.fixed_dictionaries({}, optional=dict.fromkeys(("version", "joints", "coupled"), values)))
-def test_whatever_a_file_holds_it_is_taken_or_refused(data: dict[str, object]) -> None:
+def test_any_content_gives_a_calibration_or_a_calibration_error(data: dict[str, object]) -> None:
     try:
         found = parse_calibration({"version": 1} | data, FILE)
     except CalibrationError:

@@ -97,7 +97,7 @@ palms = pytest.mark.parametrize("palm", list(Palm))
 
 
 def filled(palm: Palm) -> ctypes.LittleEndianStructure:
-    """A structure with another value in each field."""
+    """A palm's packet as a C structure, with different values in the fields that are read."""
     numbers = itertools.count(7)
     status = STRUCTURES[palm]()
     status.command = 1
@@ -149,7 +149,7 @@ def test_every_field_is_read_from_its_place(palm: Palm, appended: bytes) -> None
         (221, 9, "nonsense_packets"),
     ],
 )
-def test_a_field_that_no_palm_sends_is_counted_and_dropped(
+def test_service_packets_and_wrong_fields_are_counted_and_dropped(
     offset: int, value: int, counter: str
 ) -> None:
     data = bytearray(bytes(filled(Palm.PALM_0220)) + bytes(12))
@@ -169,7 +169,7 @@ def test_a_field_that_no_palm_sends_is_counted_and_dropped(
         *((bytes(length), "empty_packets") for length in (220, 416, 542)),
     ],
 )
-def test_what_no_palm_sends_is_counted_and_dropped(data: bytes, counter: str) -> None:
+def test_wrong_lengths_and_empty_packets_are_counted_and_dropped(data: bytes, counter: str) -> None:
     counters = PalmCounters()
     assert parse_packet(data, counters) is None
     assert (getattr(counters, counter), counters.packets) == (1, 0)

@@ -129,7 +129,7 @@ def test_a_finger_of_nothing_but_zeros_is_absent() -> None:
     assert not played.readings[1].faults.any()
 
 
-def test_a_damaged_type_moves_no_value_unseen() -> None:
+def test_a_damaged_tactile_type_flags_readings_and_moves_no_values() -> None:
     stream = packets(4)
     for position, wrong in itertools.product(range(ROUND), range(1, 29, 2)):
         damaged = list(stream)
@@ -165,7 +165,7 @@ def test_a_packet_without_samples_takes_no_place(tactile_type: int, counter: str
         (ROUND - 1, "late_packets", [[row, 23] for row in range(3)]),
     ],
 )
-def test_a_packet_overtaken_within_its_round_is_used(
+def test_an_overtaken_packet_is_used_unless_its_round_is_over(
     at: int, counter: str, lost: list[list[int]]
 ) -> None:
     stream = packets(3)
@@ -196,7 +196,9 @@ def test_a_packet_ten_cycles_overdue_means_a_lost_round(after_ns: int, lost: int
     ("after_ns", "missed"),
     [(13 * MS, 0), (14 * MS, 1), (2_000 * MS, 142), (2_000 * MS + 1, 1)],
 )
-def test_interrupted_rounds_are_counted_for_two_seconds(after_ns: int, missed: int) -> None:
+def test_rounds_missed_by_an_interruption_count_up_to_two_seconds(
+    after_ns: int, missed: int
+) -> None:
     sweeps = PalmStream(FINGERS)
     stream = packets(2)
     sweeps.interrupt()
@@ -221,7 +223,9 @@ def test_interrupted_rounds_are_counted_for_two_seconds(after_ns: int, missed: i
         (7, 0, False),  # half a round ahead
     ],
 )
-def test_a_packet_is_late_within_half_its_steps_time(step: int, after_ns: int, late: bool) -> None:
+def test_a_packet_far_ahead_but_too_soon_counts_as_late(
+    step: int, after_ns: int, late: bool
+) -> None:
     sweeps = PalmStream(FINGERS)
     stream = packets(1)
     for at in range(ROUND):
@@ -231,8 +235,8 @@ def test_a_packet_is_late_within_half_its_steps_time(step: int, after_ns: int, l
 
 
 @pytest.mark.parametrize(("copies", "batch"), [(2, 1), (1, 4)])
-def test_a_palm_whose_words_stand_still_is_read(copies: int, batch: int) -> None:
-    """Each round of such a palm equals the one before, and is not its copy."""
+def test_a_palm_that_repeats_equal_rounds_is_read_without_faults(copies: int, batch: int) -> None:
+    """Each round of such a palm equals the one before, and does not count as its copy."""
     stream, steady = PalmStream(FINGERS), packets(1)
     for outage_ns in (0, 300 * MS):
         stream.interrupt()
@@ -256,7 +260,7 @@ def test_a_palm_whose_words_stand_still_is_read(copies: int, batch: int) -> None
         (ROUND - 1, 8 * MS, True),
     ],
 )
-def test_an_equal_packet_within_half_its_time_is_a_copy(
+def test_an_equal_packet_too_soon_to_be_new_is_dropped(
     position: int, after_ns: int, is_copy: bool
 ) -> None:
     stream, steady = PalmStream(FINGERS), packets(1)
@@ -267,7 +271,7 @@ def test_an_equal_packet_within_half_its_time_is_a_copy(
 
 
 def test_a_late_copy_in_its_round_begins_no_round() -> None:
-    """A copy 8 to 12 ms late is 6 to 2 packets ahead of the last."""
+    """By its position, a copy 8 to 12 ms late could be 6 to 2 packets ahead of the last one."""
     for late_ms in range(1, 13):
         stream = PalmStream(FINGERS)
         data = [packet.to_bytes() for packet in packets(2)]
