@@ -24,7 +24,7 @@ from graspd.drivers.datagrams.messages import (
 from graspd.drivers.udp import DatagramDriver
 
 _joint_of: Final = functools.lru_cache(maxsize=64)(joint_name)
-"""Cache of 64 names: 28 joints with and without prefix, and a few unknown ones."""
+"""`joint_name` with a cache of 64 names: 28 joints with and without prefix, a few unknown ones."""
 
 
 @dataclass(slots=True)

@@ -46,10 +46,11 @@ class Stamp(NamedTuple):
     seq: int | None
     """Number of the message, one more each time; None if the sender sends none."""
     t_s: float | None
-    """Sender's own time, s, with any zero; None if the sender sends none."""
+    """Sender's own time, s, from any zero; None if the sender sends none."""
 
     def is_after(self, other: Stamp) -> bool:
-        """Return False if both have a number, or a time, and it is not after the other's."""
+        """Return False if the number or the time, where both stamps have one, is not greater than
+        the other's."""
         pairs = zip(self, other, strict=True)
         return all(own is None or its is None or own > its for own, its in pairs)
 
@@ -75,7 +76,7 @@ def write_message(stamp: Stamp, **fields: object) -> bytes:
 
 
 def read_message(data: bytes, key: str, counters: MessageCounters) -> Message | None:
-    """Return the message of a datagram, with the values of `key`; None if it is not valid.
+    """Return a datagram's message, whose values are the object `key`; None if it is not valid.
 
     Invalid messages are counted, and the log says what is wrong with the first.
     """
@@ -87,7 +88,7 @@ def read_message(data: bytes, key: str, counters: MessageCounters) -> Message | 
 
 
 def drop(data: bytes, why: object, counters: MessageCounters) -> None:
-    """Count a message that is not valid; the log says why of the first."""
+    """Count a message that is not valid, and log the reason, `why`, for the first one."""
     if not counters.bad_messages:
         shown = data[:SHOWN_BYTES_MAX].decode(errors="replace")
         _log.warning("datagrams: a message is dropped: %s: %r", why, shown)

@@ -42,7 +42,7 @@ class TactileCounters(MessageCounters):
     absent_fingers: int = 0
     """Fingers of the hand that a message lacks, or with all counts 0 or all 4095."""
     wrong_sizes: int = 0
-    """Fingers with another number of counts than 24, from another sensor."""
+    """Fingers whose value is not a list of 24 counts, such as those of another sensor."""
     bad_counts: int = 0
     """Values that are not a whole number in 0..4095."""
 
@@ -53,7 +53,7 @@ class TactileStream:
     sender_kind = "tactile stream"
 
     def __init__(self, fingers: Sequence[str], hand: str) -> None:
-        """`fingers`: the rows of a reading. `hand`: name of the hand; messages may name it."""
+        """`fingers`: the rows of a reading. `hand`: its name; messages of another are dropped."""
         self.counters = TactileCounters()
         self._fingers = tuple(fingers)
         self._hand = hand
@@ -115,7 +115,10 @@ class TactileStream:
         return TactileReading(t_ns, seq, counts, faults, interrupted=interrupted)
 
     def _counts(self, values: object) -> list[int | None] | None:
-        """Return the counts of a finger, with None for other values; None if it has no sensor."""
+        """Return the 24 counts of a finger's `values` in a message, with None for other values.
+
+        None if the finger has no sensor, or not 24 values.
+        """
         if values is None:
             self.counters.absent_fingers += 1
             return None

@@ -74,7 +74,7 @@ IMPOSSIBLE = ["NaN", "1e999", "true", "null", '"0.5"', "3.4908", "-3.4908", "1" 
         ('"elbow": 0.1, "FFJ3": 0.5', {"FFJ3": 0.5}, {"unknown_names": 1}),
     ],
 )
-def test_a_value_that_is_not_an_angle_costs_no_other(
+def test_a_value_that_is_not_an_angle_leaves_others_valid(
     joints: str, angles: dict[str, float], counted: dict[str, int]
 ) -> None:
     found, counters = parse(f'{{"v": 3, "joints": {{{joints}}}, "note": [1, {{}}]}}')
@@ -101,7 +101,7 @@ def test_a_damaged_message_gives_no_impossible_angle(
 
 
 @pytest.mark.parametrize(("step", "missed", "restarts"), [(1001, 1000, 0), (1002, 0, 1)])
-def test_a_jump_above_a_thousand_is_a_new_start(step: int, missed: int, restarts: int) -> None:
+def test_a_gap_of_over_a_thousand_counts_as_restart(step: int, missed: int, restarts: int) -> None:
     counters = JointCounters()
     order = Order(counters)
     for seq in (5, 5 + step):
@@ -128,7 +128,7 @@ def test_a_message_without_a_known_joint_is_not_a_reading(
     assert driver.link.state is LinkState.UP
 
 
-def test_joint_messages_of_a_new_start_interrupt() -> None:
+def test_the_first_reading_after_a_sender_restart_is_interrupted() -> None:
     stream, readings = JointStream(), list[JointReading]()
     for seq in (*range(50, 60), *range(20), 5000):
         readings += stream.receive(message(seq), 0) or []

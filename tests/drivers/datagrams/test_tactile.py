@@ -26,7 +26,7 @@ FINGERS = ("ff", "mf", "th")
 
 
 def message(counts: object = None, **fields: object) -> bytes:
-    """A datagram with counts of three fingers, and number 1, unless told otherwise."""
+    """A datagram with number 1 and counts of three fingers, unless the arguments differ."""
     whole = {"seq": 1, "counts": dict.fromkeys(FINGERS, COUNTS) if counts is None else counts}
     return json.dumps({**whole, **fields}).encode()
 
@@ -80,7 +80,7 @@ def test_a_message_is_a_reading(fields: dict[str, object]) -> None:
         (message(hand=["right"]), "other_hands", "names the hand ['right']"),
     ],
 )
-def test_another_message_is_counted_named_and_dropped(
+def test_a_wrong_message_is_dropped_counted_and_logged_once(
     data: bytes, counter: str, said: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     assert received(data, data, data) == ([], {counter: 3})
@@ -103,7 +103,7 @@ def test_another_message_is_counted_named_and_dropped(
         ([0, 4095, *COUNTS[:22]], {}, None, 0),
     ],
 )  # fmt: skip
-def test_a_value_that_is_not_a_count_costs_no_other(
+def test_a_value_that_is_not_a_count_leaves_others_valid(
     finger: object,
     faults: dict[ElectrodeFault, int],
     counter: str | None,
@@ -144,7 +144,7 @@ def test_any_json_is_a_reading_or_counted(
         assert not reading.counts[reading.faults != 0].any()
 
 
-def test_a_finger_without_a_name_is_left_out_and_counted() -> None:
+def test_an_unknown_finger_name_is_left_out_and_counted() -> None:
     (reading,), counters = received(message(dict.fromkeys((*FINGERS, "rf", "FF"), COUNTS)))
     assert reading.counts.tolist() == [COUNTS] * 3
     assert counters == {"readings": 1, "unknown_names": 1}
@@ -184,7 +184,7 @@ def test_a_message_that_is_not_newer_is_dropped(
         ([(0.0, 0), (1.0, 1010), (2.0, 2020)], [0, 1001.01, 2002.02]),
     ],
 )
-def test_no_message_is_younger_than_its_delay(
+def test_messages_are_dated_by_sender_time_and_quickest_delay(
     sent: list[tuple[float | None, float]], made: list[float]
 ) -> None:
     clock = SenderClock()
@@ -196,7 +196,7 @@ def test_no_message_is_younger_than_its_delay(
     ("t_s", "received_ms", "made_ms"),
     [(5.51, 2020, 1511), (4.01, 2020, 2020), (4.99, 1980, 991), (4.99, 1992, 1992)],
 )
-def test_time_that_falls_a_second_has_another_zero(
+def test_falling_sender_time_a_second_late_starts_a_new_zero(
     t_s: float, received_ms: int, made_ms: float
 ) -> None:
     clock = SenderClock()
@@ -204,7 +204,7 @@ def test_time_that_falls_a_second_has_another_zero(
     assert clock.made_ns(t_s, received_ms * MS) / MS == pytest.approx(made_ms, abs=0.03)
 
 
-def test_counts_after_a_new_start_or_loss_interrupt() -> None:
+def test_the_first_reading_after_restart_or_outage_is_interrupted() -> None:
     stream, readings = TactileStream(FINGERS, "right"), list[TactileReading]()
     for place, seq in enumerate((*range(50, 60), *range(20), 5000, 5001)):
         if place == 31:
@@ -260,8 +260,8 @@ def test_gaps_are_losses_and_new_senders_are_other_sensors(
 PERIOD_NS = 10_000_000
 START_S = 70.0
 ACTIONS = ("send", "lose", "copy", "late", "stall", "stale")
-"""What becomes of a sweep. `late`: others overtake it; `stall`: those behind it wait as well;
-`stale`: the topic repeats the time of the one before."""
+"""What happens to a sweep's message. `late`: others overtake it; `stall`: those behind it wait as
+well; `stale`: it repeats the time of the one before."""
 Plan = list[tuple[str, int]]
 """For each sweep an action, and for how many periods it is held back."""
 
@@ -277,9 +277,9 @@ def links(draw: st.DrawFn) -> Plan:
 def arrivals(
     plan: Plan, counts: Callable[[int], list[list[int]]]
 ) -> list[tuple[int, Datagram, int]]:
-    """Return reception in ns, datagram and place of its sweep, one sweep every 10 ms.
+    """Return time of arrival in ns, datagram and number of its sweep; a sweep is made every 10 ms.
 
-    `counts`: of a sweep, by finger.
+    `counts`: function that returns the counts of a sweep by its number.
     """
     found: list[tuple[int, Datagram, int]] = []
     held_until = 0
