@@ -80,7 +80,7 @@ class CanTwin(Opened):
             bus.shutdown()
 
     def send_sweep(self) -> bool:
-        """Send the frames of one sweep at once; return False after the last sweep."""
+        """Send the frames of the next sweep at once; return False if there is none."""
         frames = self.next_frames()
         for frame in frames:
             self._send(frame)
@@ -107,7 +107,7 @@ class CanTwin(Opened):
             due_ns = max(due_ns + self._period_ns, self._clock() - self._period_ns)
 
     def next_frames(self) -> list[Outgoing]:
-        """Return the frames of the next sweep, without link faults; none after the last."""
+        """Return the frames of the next sweep, without link faults; [] after the last sweep."""
         counts = next(self._counts, None)
         if counts is None:
             return []

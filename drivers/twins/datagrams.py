@@ -37,7 +37,7 @@ SENSORS_AT_REST = (
 )
 """Raw sensor words of a real hand at rest (Shadow's documentation)."""
 HALL_WORDS = 26
-"""Number of these words that get noise of one count."""
+"""Number of these words, from the first, that get noise of up to one count."""
 OTHER_COUNTS = {"PDC": 2779, "TAC": 2006, "TDC": 2247}
 PAC_COUNT = 2048
 ABSENT_WORDS = {"PDC": -22072 & 0xFFFF, "TAC": 32570, "TDC": 0}
@@ -94,7 +94,8 @@ class DatagramTwin(ABC):
         yield self._injector.flush()
 
     def serve(self, target: str, stop: threading.Event) -> None:
-        """Send to `udp://ADDRESS:PORT` until `stop` is set or the data end. Raises `ValueError`."""
+        """Send until `stop` is set or the data end. `target`: `udp://ADDRESS:PORT`, anything else
+        raises `ValueError`."""
         endpoint = Endpoint.parse(target)
         with socket.socket(endpoint.family, socket.SOCK_DGRAM) as sender:
             due_ns, cycles = time.monotonic_ns(), self.cycles()
@@ -115,8 +116,8 @@ class DatagramTwin(ABC):
 class PalmTwin(DatagramTwin):
     """Send counts, shape (fingers, 24) for each round of 14 packets, as a palm does.
 
-    `stuck_clock`: the palm always answers the same request. The words of fingers not in
-    `fingers` are those of an absent sensor; the words of fingers unplugged by a fault are not.
+    `stuck_clock`: the palm always answers the same request. Fingers that are not in `fingers`, or
+    unplugged by a fault, have the words of an absent sensor; only the former are marked invalid.
     """
 
     period_ns = CYCLE_NS

@@ -46,7 +46,7 @@ class LinkFaults:
             raise ValueError("disconnect_every_frames must be at least 1")
 
     def refuse(self, link: str, *names: str) -> None:
-        """Raise `ValueError` if one of the faults `names` is set, which a twin of `link` lacks."""
+        """Raise `ValueError` if a fault of `names` is set, which a twin of `link` cannot show."""
         for name in names:
             if getattr(self, name) != getattr(LinkFaults(), name):
                 raise ValueError(f"{link} cannot show the fault {name.replace('_', '-')}")

@@ -75,7 +75,8 @@ class SpiTwin(Opened):
         clock: Callable[[], int] = time.monotonic_ns,
         tap: Callable[[bytes], None] | None = None,
     ) -> None:
-        """`tap`: called with all bytes to the host. Raises `ValueError`."""
+        """`tap`: called with all bytes to the host. Raises `ValueError` for a rate not above 0, a
+        source without counts, or an unknown channel."""
         if not rate_hz > 0.0:
             raise ValueError(f"rate_hz is {rate_hz}, must be positive")
         counts = iter(source)
@@ -131,7 +132,7 @@ class SpiTwin(Opened):
         self._replug_ns = None
 
     def plug(self) -> None:
-        """Link the path to a new pseudo-terminal, and send HELLO."""
+        """Link the path to a new pseudo-terminal, and send HELLO. Raises `FileExistsError`."""
         self.unplug()
         self._refuse_to_replace()
         self._replug_ns = None
@@ -170,11 +171,11 @@ class SpiTwin(Opened):
         self._unsent_bytes = 0
 
     def pull_fingers(self, *fingers: int) -> None:
-        """Unplug the sensors of these fingers."""
+        """Unplug the sensors of these fingers, numbered from 0, and of no others."""
         self._faults = dataclasses.replace(self._faults, unplugged_fingers=fingers)
 
     def due_ns(self) -> int | None:
-        """Return the time of the next sweep, status or plugging in, ns."""
+        """Return the time of the next sweep, status or plugging in, ns; None: nothing is due."""
         if self._master is None:
             return self._replug_ns
         if self._sweeping() and not self._unsent:
@@ -311,7 +312,7 @@ class SpiTwin(Opened):
         self._drain()
 
     def _write(self, data: bytes) -> None:
-        """Queue whole frames; drop them if the host does not read."""
+        """Queue a whole frame; drop it if the host does not read, so that too many bytes wait."""
         if self._unsent_bytes + len(data) > UNSENT_MAX_BYTES and self._unsent:
             self.tx_dropped += 1
             return

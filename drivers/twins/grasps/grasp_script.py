@@ -136,7 +136,7 @@ class GraspScript:
         )
 
     def deviation(self, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return counts less the rest, shape (fingers, 24). `t_s`: shape () or (24,)."""
+        """Return counts minus those at rest, shape (fingers, 24), at times `t_s`, () or (24,)."""
         timetable = self.timetable
         if t_s.max() <= min(timetable.touched_s) or t_s.min() >= timetable.open_s:
             return np.zeros_like(self._deviation)
@@ -166,7 +166,10 @@ class GraspScript:
     def _lift_changes(
         self, slipped: bool, rng: np.random.Generator
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return load, counts, and lost share of the deviation, shape (fingers, 24) each."""
+        """Return load, counts, and lost share of the deviation, shape (fingers, 24) each.
+
+        The load is 0 if the object slipped, the lost share if it did not.
+        """
         nothing = np.zeros_like(self._deviation)
         if slipped:
             losing = rng.random(nothing.shape) < SLIPPING_ELECTRODES

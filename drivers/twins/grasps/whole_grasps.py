@@ -24,7 +24,7 @@ from graspd.drivers.twins.grasps.grasp_script import (
 )
 
 Counting = Callable[[NDArray[np.float64]], NDArray[np.float64]]
-"""Counts over time, shape (fingers, 24), by sample times, s, of shape () or (24,)."""
+"""Function of sample times, s, shape () or (24,), that returns counts, shape (fingers, 24)."""
 RATE_HZ = 100.0
 """Rows per second in the public recordings; sweeps per second of an SPI bridge."""
 PALM_RATE_HZ = 1000 / 14
@@ -87,8 +87,8 @@ class WholeGrasps:
     ) -> None:
         """Raises `ValueError` for a wrong rate.
 
-        `rest`: untouched counts, shape (fingers, 24). `held`: see `Sampler`. `noise`:
-        `MeasuredNoise` by default. `loop`: repeat the end points without end.
+        `rest`: untouched counts, shape (fingers, 24). `held`: see `Sampler`. `noise`: makes the
+        noise of a number of fingers; None: `MeasuredNoise`. `loop`: repeat the end points for ever.
         """
         if not 0.0 < rate_hz < float("inf"):
             raise ValueError(f"rate_hz is {rate_hz}, must be positive")
@@ -198,7 +198,7 @@ class Sampler:
         self._present = self._former = np.zeros(rest.shape, dtype=np.uint16)
 
     def sample(self, deviation: Counting, t_s: float) -> NDArray[np.uint16]:
-        """Return the counts of the row at `t_s`. `deviation`: counts less the rest."""
+        """Return the counts of the row at `t_s`. `deviation`: counts minus those at rest."""
         if not self._held:
             return self._sweep(deviation, np.asarray(t_s))
         number, into_ms = divmod(round(t_s * 1000.0), ROUND_MS)
@@ -237,7 +237,7 @@ def synthetic_grasps(
     loop: bool = False,
     seed: int = 0,
 ) -> WholeGrasps:
-    """Return a stream of synthetic grasps, half of them slips. Raises `ValueError`."""
+    """Return a stream of synthetic grasps, half of them slips. Raises `ValueError` for a rate."""
     model = synthetic.read_model()
     rng = np.random.default_rng([seed, 2])
     shape = (-1, len(TABLE_FINGERS), ELECTRODES)

@@ -1,4 +1,4 @@
-"""What twins may feel in tests: the noise of a recording played again, and grasps of scripts."""
+"""Signals for twins in tests: noise of a recording played again, and grasps of tables."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from graspd.drivers.twins.grasps.grasp_script import EndPoint, Timetable
 from graspd.drivers.twins.grasps.whole_grasps import Counting
 
 PALM_ROWS = 7
-"""Rows of 10 ms in which a palm's rounds of 14 ms come round again, ..."""
+"""Number of rows, 10 ms apart, after which a round of 14 ms begins with a row again."""
 PALM_STALE_ROWS = 2
-"""... and how many of them repeat an electrode: 28.57 %, verified in the untouched recording."""
+"""Number of these rows that repeat an electrode: 28.57 %, verified in the untouched recording."""
 
 
 def played(
     residuals: NDArray[np.float64],
 ) -> Callable[[int, np.random.Generator], Counting]:
-    """The noise of whole grasps: residuals, shape (rows, fingers, 24), in a loop.
+    """Return a `noise` for `WholeGrasps` that plays `residuals`, (rows, fingers, 24), in a loop.
 
-    One row per sweep, from a random start; nothing is added.
+    Each sweep has one row, from a random row on; nothing is added.
     """
 
     def begin(_fingers: int, rng: np.random.Generator) -> Counting:
@@ -63,7 +63,7 @@ def fresh_residuals(held: NDArray[np.uint16]) -> NDArray[np.float64]:
 
 
 def crept_s(timetable: Timetable, rate_counts_per_s: float) -> float:
-    """When the mean rate of the electrodes falls below this rate, s, leaving out the lift.
+    """Time, s, when the mean speed of creep falls to this rate, if no lift came before.
 
     Never before `closed_s`; later than `lift_s` if the lift comes first.
     """

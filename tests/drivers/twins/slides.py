@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from graspd.biotac import ELECTRODES
 
 NOISE_COUNTS = (3.0, 4.5)
-"""Standard deviation of an electrode, another one for each finger, counts. With the wander,
+"""Lowest and highest standard deviation of a finger's electrodes, counts. With the wander,
 successive sweeps differ by 2.9 to 4.2 times the square root of two."""
 ECHO = 0.36
 """Share of a sweep's noise that comes again in the next one: correlations of 0.32 at one sweep and
@@ -23,48 +23,49 @@ of 0 at two (measured: 0.32 and 0.03)."""
 SPIKE_PROBABILITY = 0.0017
 """Chance per electrode and sweep of a downward spike of more than 25 counts."""
 SPIKE_COUNTS = (25.0, 60.0)
-"""Depth of one, counts."""
+"""Lowest and highest depth of a spike, counts."""
 RELAXATION_COUNTS_PER_S = 12.0
-"""How fast an electrode moves (root mean square) when a hold begins, counts/s ..."""
+"""Root mean square of an electrode's speed when the median hold begins, counts/s."""
 RELAXATION_SPREAD = 0.6
-"""... and by which factor that differs: standard deviation of its logarithm."""
+"""Standard deviation of the logarithm of that speed, between holds."""
 RELAXATION_TAU_S = 0.7
-"""Time constant of this motion, s. Not measured; it fits the quantiles of held touches."""
+"""Time constant of the motion after a hold begins, s. Not measured; it fits the quantiles of held
+touches."""
 HOLD_DIRECTIONS = (0.68, 0.32)
 """Shares of a hold's variance along one direction of the 24 electrodes, and along others."""
 WANDER_COUNTS_PER_S = 66.0
-"""The pressure of a hold wanders: root mean square of an electrode's speed, counts/s ..."""
+"""Root mean square of an electrode's speed as the pressure of a hold wanders, counts/s."""
 WANDER_SPREAD, WANDER_MOMENT_SPREAD = 0.3, 0.25
-"""... and by which factor holds, and moments of a hold, differ: standard deviations of the
-logarithm. These and the times fit the quantiles of held touches, and for how long the gate of one
-limit took real ones for moving."""
+"""Standard deviations of the logarithm of that speed, between holds and between moments of a hold.
+These and the times fit the quantiles of held touches, and the time for which a gate with one limit
+counted real ones as moving."""
 WANDER_TURN_TAU_S = 0.02
-"""The wander has another direction after this time, s ..."""
+"""Time after which the wander has another direction, s."""
 WANDER_TAU_S = 0.06
-"""... and has gone back after this time, s."""
+"""Time after which the wander has gone back, s."""
 SLIDE_DIRECTIONS = (0.81, 0.14, 0.05)
-"""The same of a slide: along one, along a second, and along others."""
+"""Shares of a slide's variance along one direction, along a second, and along others."""
 STANDSTILL_S = (0.0, 0.2)
-"""Time without a slide at the beginning, and again at the end, s."""
+"""Shortest and longest time without a slide at the beginning, and again at the end, s."""
 SLIDE_WANDER = 1.5
-"""The pressure of a slide wanders faster than that of a hold by this factor."""
+"""Factor by which the pressure of a slide wanders faster than that of a hold."""
 SPEED_COUNTS_PER_S = 76.0
-"""Root mean square of an electrode's speed in the median slide, counts/s ..."""
+"""Root mean square of an electrode's speed in the median slide, counts/s."""
 SLIDE_SPREAD, MOMENT_SPREAD = 0.58, 0.5
-"""... and by which factor slides, and moments of a slide, differ: standard deviations of the
-logarithm. These and the times fit the quantiles of slides."""
+"""Standard deviations of the logarithm of that speed, between slides and between moments of a
+slide. These and the times fit the quantiles of slides."""
 MOMENT_TAU_S = 0.2
-"""An object sticks and slips: its speed is another one after this time, s ..."""
+"""Time after which the speed of a slide is another one, s, because the object sticks and slips."""
 TURN_TAU_S = 0.1
-"""... and its direction after this time, s."""
+"""Time after which a slide has another direction, s."""
 STEP_S = 0.005
-"""Between two points of the way, s; it is straight between them."""
+"""Time between two points of a motion, s, which is straight between them."""
 SECONDS = 3.0
 """Length of a stream, s."""
 
 
 class Hold:
-    """How far the electrodes of some fingers have moved since a hold began."""
+    """Motion of the electrodes of some fingers while an object is held, or slides along them."""
 
     def __init__(
         self,
@@ -77,9 +78,9 @@ class Hold:
     ) -> None:
         """`sliding` says of each finger whether the object slides along it, or is held.
 
-        For the first `rest_s` nothing has begun: all stand still. Slides begin at `slide_s`, until
-        which the object is held; unless given, after a standstill. With a `slide_spread` of 0 all
-        have the speed of the median one.
+        Nothing moves before `rest_s`. Slides begin at `slide_s`, and the object is held until then;
+        None: they begin after a standstill. With a `slide_spread` of 0 all have the speed of the
+        median one.
         """
         self._times = np.arange(0.0, seconds + STEP_S, STEP_S)
         ways = [
@@ -93,7 +94,7 @@ class Hold:
         self._ways = [[(along, way) for along, way in finger] for finger in ways]
 
     def deviation(self, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Counts, shape (fingers, 24), as sampled at `t_s`, shape () or (24,)."""
+        """Counts minus those at rest, shape (fingers, 24), as sampled at `t_s`, () or (24,)."""
         moved = [
             sum(np.interp(t_s, self._times, along) * way for along, way in finger)
             for finger in self._ways
@@ -121,7 +122,7 @@ class HeldNoise:
 
 
 Way = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""How far along a direction at each time, and the direction, shape (24,)."""
+"""Distance along a direction at each time, shape (times,), and the direction, shape (24,)."""
 
 
 def _relaxation(times: NDArray[np.float64], rng: np.random.Generator) -> Iterator[Way]:

@@ -1,4 +1,4 @@
-"""Whole grasps: the demos, which hold their course and noise byte for byte, and held values."""
+"""Whole grasps: the demos, generated again byte for byte, and no real grasp among them."""
 
 from __future__ import annotations
 
