@@ -1,1 +1,1 @@
-"""Judges of held grasps by their counts: pure, without time, for the daemon and for training."""
+"""Judges of held grasps by their counts, without clock or I/O, for the daemon and for training."""

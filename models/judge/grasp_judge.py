@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 FLAT_SPREAD_COUNTS = 70.0
 """Smallest standard deviation over the electrodes of a finger that touches and works, counts.
 
-It is half of 148, the smallest of 4682 real grasps.
+It is about half of 148, the smallest of 4682 real grasps.
 """
 TINY = 1e-12  # for a probability of zero, which has no logarithm
 
@@ -55,11 +55,12 @@ class Examined(msgspec.Struct, frozen=True, eq=False, gc=False):
     """Counts of a grasp after repair, and whether a network may judge them."""
 
     counts: NDArray[np.generic]
-    """Shape (fingers, 24): as read, except electrodes that contradict the others."""
+    """Shape (fingers, 24): as read, or repaired for electrodes that are broken or contradict the
+    others."""
     refusal: Refusal | None = None
     """Why they must not be judged; None: they are sound, or could be repaired."""
     repaired: tuple[str, ...] = ()
-    """Electrodes that were repaired because they contradict the others, such as `ff_7`."""
+    """Electrodes that were repaired because they are broken or contradict the others, as `ff_7`."""
     grasp: NDArray[np.generic] | None = None
     """Counts that the session may learn from, shape (fingers, 24). None: it must not.
 

@@ -63,12 +63,12 @@ class SessionCalibration:
         return values
 
     def from_training(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The inverse of `to_training`."""
+        """Return counts as today's sensors would read `values`; the inverse of `to_training`."""
         counts: NDArray[np.float64] = self.counts_mean + (values - self._training[0]) / self.scale
         return counts
 
     def observe(self, counts: NDArray[np.generic], *, slip: bool | None = None) -> None:
-        """Take in the counts of a grasp, shape (fingers, 24).
+        """Take in the counts of a grasp, shape (fingers, 24), unless they repeat the last one's.
 
         `slip`: True if it was judged to slip; None: it was not judged.
         """

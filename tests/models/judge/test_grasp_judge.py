@@ -24,7 +24,7 @@ def logit(probability: float) -> float:
 
 
 class Answers(FakeModel):
-    """Says both probabilities as it is told."""
+    """Model that answers with the given probabilities."""
 
     def __init__(self, p_stable: float, p_slip: float) -> None:
         super().__init__()
@@ -39,7 +39,7 @@ def judge_of(model: FakeModel, threshold: float = 0.5) -> GraspJudge:
 
 
 def session(temperature: float) -> SessionCalibration:
-    """A session without grasps that softens by this."""
+    """A session without grasps, with this divisor of the network's log-odds."""
     softens = (Sharpness(0.0, temperature),)
     takes = SessionInput((0.0,) * 78, (1.0,) * 78, 5.0, 1.0, 20.0, softens)
     return SessionCalibration(takes, np.ones((3, 24)), np.ones((3, 24)))
@@ -81,7 +81,7 @@ def test_probabilities_are_in_0_to_1_and_sum_to_one(
 @pytest.mark.parametrize("threshold", [0.3, 0.8])
 @pytest.mark.parametrize("p_slip", [0.05, 0.4, 0.6])
 @pytest.mark.parametrize("temperature", [1.0, 2.0, 5.0])
-def test_a_young_session_is_less_sure_on_the_same_side(
+def test_a_young_session_moves_probabilities_towards_the_threshold(
     threshold: float, p_slip: float, temperature: float
 ) -> None:
     judge = judge_of(FakeModel(p_slip), threshold)
@@ -120,7 +120,7 @@ def test_a_finger_that_reads_about_the_same_everywhere_is_flat(
 
 
 @pytest.mark.parametrize(("swing", "flat"), [(0, True), (2, False)])
-def test_a_finger_without_an_image_is_not_judged(swing: int, flat: bool) -> None:
+def test_a_finger_whose_electrodes_all_agree_is_not_judged(swing: int, flat: bool) -> None:
     """Its electrodes differ by less than a count (standard deviation)."""
     counts, model = COUNTS.copy(), FakeModel(0.2)
     counts[1] = 2000 + swing * (-1) ** np.arange(24)
@@ -129,7 +129,7 @@ def test_a_finger_without_an_image_is_not_judged(swing: int, flat: bool) -> None
     assert model.runs == (0 if flat else 1)
 
 
-def test_a_session_model_is_asked_about_what_its_session_standardises() -> None:
+def test_a_session_model_gets_features_standardised_by_its_session() -> None:
     judge = GraspJudge.of(TactileModel(zoo.find("small-session")))
     judge.session = known = session(1.0)
     known.features_mean, known.features_spread = np.arange(78.0), np.linspace(1.0, 900.0, 78)
@@ -158,7 +158,7 @@ def cnn1() -> GraspJudge:
 
 @pytest.fixture(scope="module")
 def grasp(cnn1: GraspJudge) -> NDArray[np.uint16]:
-    """One that is judged as it is: shape (3, 24)."""
+    """A grasp that is judged without repair, shape (3, 24)."""
     drawn = synthetic.draw(synthetic.read_model(), np.random.default_rng(1), 50)
     for counts in drawn.counts.reshape(50, 3, 24):
         found = cnn1.examine(counts, NOTHING)
@@ -207,7 +207,7 @@ def of_sessions() -> GraspJudge:
         (4.0, {"calibrated": False}, False, True),  # a young one learns from all
     ],
 )
-def test_a_session_learns_at_twice_the_distance_it_judges(
+def test_a_session_learns_up_to_twice_the_distance_it_judges(
     of_sessions: GraspJudge,
     stretched: float,
     known: dict[str, bool],

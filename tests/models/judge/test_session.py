@@ -1,4 +1,4 @@
-"""What a session's own grasps make of its sensors, with a training of round numbers."""
+"""Calibration of a session by its own grasps, with a training of round numbers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def new_session() -> SessionCalibration:
 
 
 def grasps(number: int, mean: float = MEAN, spread: float = SPREAD) -> NDArray[np.float64]:
-    """Shape (number, 3, 24)."""
+    """Drawn counts, shape (number, 3, 24)."""
     return np.random.default_rng(3).normal(mean, spread, (number, *SHAPE))
 
 
@@ -73,7 +73,7 @@ def test_a_count_is_mapped_by_its_distance_in_spreads() -> None:
     assert (session.from_training(session.to_training(counts)) == counts).all()
 
 
-def test_the_training_counts_as_one_grasp_of_a_session() -> None:
+def test_the_training_weighs_as_much_as_one_session_grasp() -> None:
     session, seen = new_session(), grasps(200, mean=2300.0, spread=60.0)
     for counts in seen:
         session.observe(counts)
@@ -89,7 +89,7 @@ def test_the_training_counts_as_one_grasp_of_a_session() -> None:
     ("mean", "possible"), [(0.0, True), (4095.0, True), (-0.1, False), (4095.1, False)]
 )
 @pytest.mark.parametrize("place", [78, 78 + 71])
-def test_kept_means_are_those_of_counts(mean: float, possible: bool, place: int) -> None:
+def test_kept_means_outside_0_to_4095_are_refused(mean: float, possible: bool, place: int) -> None:
     session = new_session()
     for counts in grasps(5):
         session.observe(counts)
