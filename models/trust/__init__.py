@@ -1,1 +1,1 @@
-"""Learning from outcomes, and the risk rule; pure functions without clock and peers."""
+"""Learning from outcomes, and the risk rule; without clock or I/O."""

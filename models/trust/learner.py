@@ -48,7 +48,8 @@ Without these limits one false outcome turns slips of unlike grasps `stable`."""
 
 
 class LearnerState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """State of a learner, as in `Residual`; arrays are float64, little-endian, row by row."""
+    """State of a learner: m of `Residual` as `mean` and its S as `covariance`; arrays are float64,
+    little-endian, row by row."""
 
     outcomes: Annotated[int, msgspec.Meta(ge=0)]
     mean: bytes
@@ -119,7 +120,7 @@ class Learner:
         return np.concatenate((features, self._residual.shared(features[2:])))
 
     def learn(self, features: Vector, *, slipped: bool) -> None:
-        """Learn the outcome of a grasp with these features of `judge`; takes 0.5 to 1 ms."""
+        """Learn the outcome of a grasp for which `judge` returned `features`; takes 0.5 to 1 ms."""
         residual, weights = self._residual, slice(len(features))
         mean, known = self._mean, self._known(features)
         seen = self._spread @ known
@@ -180,7 +181,7 @@ class Learner:
 
 
 def of_format_2(state: LearnerState) -> LearnerState:
-    """Return a state in format 2, which holds the result of `at_told`. Raises `ValueError`."""
+    """Convert a state from format 2, which held the result of `at_told`. Raises `ValueError`."""
     mean, grasps = (np.frombuffer(each, "<f8") for each in (state.mean, state.grasps))
     size, count = len(mean), min(state.outcomes, GRASPS_MAX) if state.grasps else 0
     residual = Residual(grasps.reshape(count, -1) if count else np.empty((0, size - 2)))
@@ -196,7 +197,7 @@ def sigmoid(log_odds: float) -> float:
 
 
 def vector(data: bytes, width: int, limit: float = math.inf) -> Vector:
-    """Return float64 values (width,).
+    """Return the little-endian float64 values of `data`, shape (width,).
 
     Raises `ValueError` for another length, and for values not finite or beyond +-`limit`.
     """

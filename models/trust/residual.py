@@ -74,7 +74,8 @@ class Residual:
         return np.delete(mean, oldest) + mean[oldest] * along, spread
 
     def limited(self, mean: Vector, limit: float) -> Vector:
-        """Move the mean of a state until all weights and told residuals are within +-`limit`."""
+        """Return a state's mean, changed in place so that all weights and told residuals are within
+        +-`limit`."""
         weights = len(mean) - len(self.grasps)
         values = self.prior @ mean[weights:]
         if (np.abs(values) > limit).any():
@@ -91,7 +92,7 @@ class Residual:
         return links @ mean, (covariance + covariance.T) / 2.0
 
     def from_others(self, mean: Vector, covariance: Matrix) -> tuple[Vector, Matrix]:
-        """Reverse `at_told`."""
+        """Return mean and spread of the state for which `at_told` returns these."""
         back, covariance = np.linalg.inv(self._links(len(mean))), covariance.copy()
         weights = len(mean) - len(self.grasps)
         covariance[weights:, weights:] -= self.prior
@@ -99,7 +100,10 @@ class Residual:
         return back @ mean, (spread + spread.T) / 2.0
 
     def _links(self, size: int) -> Matrix:
-        """Return the matrix that maps a state of this size to the residual at the told grasps."""
+        """Return the matrix that maps the mean of a state to weights and residual at told grasps.
+
+        `size`: W + N.
+        """
         links, weights = np.eye(size), size - len(self.grasps)
         links[weights:, weights:] = self.prior
         return links

@@ -12,15 +12,15 @@ import msgspec
 
 BUDGET_START: Final = 5.0
 """Number of slips beyond the allowed share that a session may have. With 3 a session is blocked
-early; with 4 fewer good lifts are kept."""
+early; with 4 fewer good lifts are called `stable`."""
 BUDGET_MAX: Final = 8.0
 """Largest budget, slips. It bounds the slips in every stretch of lifts."""
 SHARE_YOUNG: Final = 1.5
 """Largest probability of slip called `stable` before any outcome, in units of the allowed share.
 With a full budget the surest grasps slip much less often than the threshold says."""
 SHARE_PROVEN: Final = 3.0
-"""The same once `PROVEN_FROM` outcomes are known. With 3, seven sessions in ten keep to the target.
-With 5, 3 to 6 % more good lifts are kept, but 54 % of sessions exceed the target, not 29 %."""
+"""As `SHARE_YOUNG`, but from `PROVEN_FROM` outcomes on. With 3, seven in ten sessions keep to the
+target. With 5, 3 to 6 % more good lifts are `stable`, but 54 % of sessions exceed it, not 29 %."""
 PROVEN_FROM: Final = 40
 """Number of outcomes after which the learner knows the day."""
 ROUNDING: Final = 1e-9
@@ -181,7 +181,8 @@ class Risk:
         return Permission.UNPROVEN if awaited >= self.limits.outstanding_max else Permission.ALLOWED
 
     def supervised(self, permission: Permission, seed: str, grasp: int) -> bool:
-        """Return True to request a lift under supervision; `seed` and `grasp` decide draws."""
+        """Return True to request a lift under supervision. A withheld grasp is drawn with the
+        probability `explore`; `seed` and `grasp` decide the draw."""
         if permission is not Permission.WITHHELD:
             return permission is Permission.UNPROVEN
         digest = hashlib.blake2b(f"{seed} {grasp}".encode(), digest_size=8).digest()
@@ -222,7 +223,7 @@ class Risk:
         return RiskState(alpha, self.lifts, self.slips, self.proven, self.budget)
 
     def restore(self, state: RiskState) -> None:
-        """Continue from an earlier state; with another risk than now, only the warm-up counts.
+        """Continue from an earlier state; with another `max_slip_when_stable`, take only `proven`.
 
         Raises `ValueError`, and changes nothing, if no outcomes lead to such a state.
         """

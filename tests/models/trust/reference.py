@@ -1,4 +1,4 @@
-"""The learner once more, independently: the weights and the residual at all grasps of a stream.
+"""An independent learner for comparison: weights and the residual at all grasps of a stream.
 
 It knows all grasps from the start, is dense, and in long double.
 """
@@ -13,7 +13,7 @@ Exact = NDArray[np.longdouble]
 MARGIN_SPREAD, BIAS_SPREAD, FEATURE_SPREAD = Number("0.5"), Number("0.5"), Number("0.2")
 TEMPERATURE, SCALE, DRIFT = Number("2"), Number("2.8"), Number("0.002")
 MOVE_MAX, WEIGHTS_MOVE_MAX = Number("1.25"), Number("0.5")
-"""Most that one outcome moves of its own grasp, all and by the weights, standard deviations."""
+"""Most standard deviations by which an outcome moves its grasp's log-odds: in all, by weights."""
 SHARED, OWN, REACH = Number("9"), Number("0.009"), Number("0.5")
 """Variances of the residual, shared and a grasp's own, and how far it reaches."""
 PI = Number("3.14159265358979323846264338327950288")
@@ -65,11 +65,11 @@ class Reference:
         self.covariance += self.drift * (self.prior - self.covariance)
 
     def keep(self, told: list[int]) -> None:
-        """Keep the weights and the residual at these grasps; what they say of others is left."""
+        """Keep the weights and the residual at these grasps, and of others only what they imply."""
         self.go_on(told, *self.state(told))
 
     def go_on(self, told: list[int], mean: Exact, covariance: Exact) -> None:
-        """Continue from what `state` of another one returned for these grasps."""
+        """Continue from mean and covariance that another `Reference` returned for these grasps."""
         kept = [*self.weights, *(len(self.weights) + grasp for grasp in told)]
         links = self.prior[:, kept] @ inverse(self.prior[np.ix_(kept, kept)])
         left = self.prior - links @ self.prior[kept]
@@ -83,7 +83,7 @@ class Reference:
 
 
 def inverse(matrix: Exact) -> Exact:
-    """By Gauss and Jordan, of a positive definite matrix: no pivoting is needed."""
+    """Return the inverse of a positive definite matrix by Gauss and Jordan, without pivoting."""
     size = len(matrix)
     rows = np.hstack((matrix, np.eye(size, dtype=Number)))
     for k in range(size):

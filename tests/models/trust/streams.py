@@ -18,7 +18,7 @@ Outcome = tuple[float, NDArray[np.float32], bool]
 def lifts(
     number: int, inputs: int, seed: int = 0, strength: float = 0.6, spread: float = 1.0
 ) -> Iterator[Outcome]:
-    """Margin, input and outcome; the truth is a logistic model, not the margin's."""
+    """Yield margin, inputs and outcome of lifts; a logistic model of margin and inputs is true."""
     random = np.random.default_rng(seed)
     weights = random.normal(0.0, strength / math.sqrt(inputs), inputs)
     for _ in range(number):

@@ -17,7 +17,7 @@ from tests.models.trust.streams import CLIP, learn, lifts
 ONE_FINGER, THREE_FINGERS = 26, 78
 
 
-def test_a_margin_beyond_thirty_says_no_more_than_thirty() -> None:
+def test_margins_beyond_thirty_are_clipped_to_thirty() -> None:
     learner, x = Learner(2), np.zeros(2)
     for margin in (30.5, 1e9):
         for sign in (1.0, -1.0):
@@ -97,7 +97,7 @@ def test_any_outcomes_leave_a_bounded_positive_definite_covariance(kind: str) ->
         (0.0, np.zeros((1, 3))),
     ],
 )
-def test_what_is_not_finite_or_of_another_shape_is_refused(
+def test_values_not_finite_or_of_another_shape_are_refused(
     margin: float, inputs: NDArray[np.float64]
 ) -> None:
     with pytest.raises(ValueError, match=r"not finite|of shape"):
@@ -115,8 +115,8 @@ def test_one_lift_that_held_makes_no_sure_slip_stable(margin: float) -> None:
 
 
 @pytest.mark.parametrize("true_outcomes", [0, 5, 20, 60])
-def test_one_lie_turns_few_unlike_slips_stable(true_outcomes: int) -> None:
-    """Slips and holds as the network knows them; each slip in turn is told as held."""
+def test_one_false_outcome_turns_few_unlike_slips_stable(true_outcomes: int) -> None:
+    """Each slip after the true outcomes is in turn reported as held."""
     random = np.random.default_rng(2)
     axis = random.normal(size=THREE_FINGERS)
     slips = random.random(180) < 0.5

@@ -14,7 +14,7 @@ from tests.models.trust.streams import lifts
 
 INPUTS = 26
 LENGTH = 0.5 * INPUTS**0.5
-"""Length of the kernel: 0.5 an input."""
+"""Length scale of the kernel: a root mean square difference of inputs of 0.5."""
 SHARED, OWN = 9.0, 0.009
 
 
@@ -31,7 +31,7 @@ def test_the_prior_is_scikit_learns_kernel() -> None:
 
 
 @pytest.mark.parametrize(("kept", "spread"), [(128, 0.5), (7, 0.5), (7, 1e-6), (7, 100.0)])
-def test_learning_is_that_of_all_grasps_known_from_the_start(
+def test_the_learner_equals_a_dense_reference_that_knows_all_grasps(
     kept: int, spread: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Grasps nearly equal make a kernel that is nearly singular."""
@@ -69,7 +69,7 @@ def test_rounding_of_many_outcomes_does_not_add_up(monkeypatch: pytest.MonkeyPat
         state = reference.state(list(range(len(window)))[-kept:])
 
 
-def test_a_thousandfold_repeated_grasp_leaves_a_covariance() -> None:
+def test_a_grasp_repeated_384_times_leaves_a_valid_covariance() -> None:
     learner = Learner(INPUTS)
     x = grasps(1)[0]
     for index in range(3 * GRASPS_MAX):

@@ -12,7 +12,7 @@ from graspd.models.trust.risk import Permission, Risk, RiskLimits, RiskState
 ALPHAS = (0.001, 0.01, 0.02, 0.05, 0.1, 0.25, 0.3, 0.5)
 ROUNDING = 1e-6
 START = 5.0
-"""Slips beyond the share."""
+"""Number of slips that are allowed beyond the share."""
 
 
 def risk(alpha: float | None = 0.05, warm_up: int = 0, explore: float = 0.0) -> Risk:
@@ -20,14 +20,17 @@ def risk(alpha: float | None = 0.05, warm_up: int = 0, explore: float = 0.0) -> 
 
 
 def lift(rule: Risk, log_odds: float, slips: Callable[[bool], bool]) -> bool:
-    """A lift whose outcome is told at once; returns whether it was called stable."""
+    """Take in a lift's outcome at once; return whether it was called stable.
+
+    `slips`: function that returns the outcome for this answer.
+    """
     stable = rule.decide(log_odds) is Permission.ALLOWED
     rule.take(stable=stable, slipped=slips(stable), proves=True)
     return stable
 
 
 @pytest.mark.parametrize("alpha", ALPHAS)
-def test_slips_of_every_stable_lift_end_stable(alpha: float) -> None:
+def test_stable_ends_within_nine_lifts_if_all_of_them_slip(alpha: float) -> None:
     rule = risk(alpha)
     for _ in range(1000):
         lift(rule, -1e9, lambda stable: stable)
@@ -40,7 +43,7 @@ def test_slips_of_every_stable_lift_end_stable(alpha: float) -> None:
 
 
 @pytest.mark.parametrize("alpha", ALPHAS)
-def test_in_the_long_run_the_share_is_as_set(alpha: float) -> None:
+def test_over_many_lifts_the_slip_share_nears_the_allowed_one(alpha: float) -> None:
     # An adversary that holds just long enough to be believed again.
     rule = risk(alpha)
     for _ in range(20_000):
@@ -68,7 +71,7 @@ def test_the_threshold_rises_with_outcomes_and_falls_with_the_budget() -> None:
     assert probability() == pytest.approx(1.0 / (1.0 + 85.0 / 15.0 * 4.05 / 3.1))
 
 
-def test_only_a_number_up_to_the_threshold_is_allowed() -> None:
+def test_only_log_odds_up_to_the_threshold_are_allowed() -> None:
     rule = risk(0.05)
     assert rule.decide(rule.threshold) is Permission.ALLOWED
     assert rule.decide(math.nextafter(rule.threshold, 0.0)) is Permission.WITHHELD
@@ -88,7 +91,7 @@ def test_too_many_outstanding_announced_lifts_make_the_next_unproven() -> None:
     assert risk(None).decide(-9.0, awaited=99) is Permission.ALLOWED
 
 
-def test_the_warm_up_asks_for_lifts_of_unsure_grasps() -> None:
+def test_the_warm_up_requests_supervised_lifts_of_unsure_grasps() -> None:
     rule = risk(0.05, warm_up=3)
     for left in (3, 2, 1):
         assert rule.warm_up_left == left
