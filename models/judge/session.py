@@ -86,7 +86,7 @@ class SessionCalibration:
         return self._statistics.state()
 
     def restore(self, state: SessionState) -> None:
-        """Continue a kept session. Raises `ValueError` if it does not fit model and counts."""
+        """Continue a saved session. Raises `ValueError` if it does not fit model and counts."""
         counts = np.array(state.mean[len(self._takes.mean) :])
         if ((counts < 0.0) | (counts > COUNT_MAX)).any():
             raise ValueError("holds means that no counts have")

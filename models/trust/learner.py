@@ -39,7 +39,7 @@ MEAN_MAX: Final = 25.0
 """Largest mean of a weight, and of the residual (log-odds), whatever outcomes come: 50 times the
 margin's standard deviation, 8 times the residual's."""
 ROUNDING: Final = 1.0 + 1e-9
-"""Factor by which a kept mean or variance may be above its limit."""
+"""Factor by which a saved mean or variance may be above its limit."""
 
 MOVE_MAX, WEIGHTS_MOVE_MAX = 1.25, 0.5
 """Most standard deviations by which one outcome moves its own grasp's mean log-odds: in total, and

@@ -93,9 +93,10 @@ class Risk:
     With a = `max_slip_when_stable`, N `stable` lifts and S slips among them, M = `outstanding_max`:
 
         S <= a N + BUDGET_START            S <= a N + BUDGET_MAX of any stretch of lifts
-        S <= a N + BUDGET_START + M (1 - a)     of all lifts that were told or announced
+        S <= a N + BUDGET_START + M (1 - a)     of all lifts with an outcome, or announced
 
-    1. A told `stable` lift adds a - y to the budget b, y = 1 for a slip; all else only lowers b.
+    1. The outcome of a `stable` lift adds a - y to the budget b, y = 1 for a slip, 0 otherwise; all
+       else only lowers b.
     2. Hence b <= BUDGET_START + a N - S, which is S <= a N + BUDGET_START - b.
     3. A stretch begins at b <= BUDGET_MAX. In the same way S <= a N + BUDGET_MAX - b for it.
     4. `stable` is said only while b >= 1 - a. If each outcome is told before the next `stable`,
@@ -111,7 +112,7 @@ class Risk:
     10. Late outcomes of lifts without an announcement can leave b < 0; `bound` adds that.
 
     The threshold, the learner, the model and the data play no part: any threshold has these bounds.
-    They count what was told, true or not. It is a rule of online selective inference: Gibbs and
+    They count reported outcomes, true or not. It is a rule of online selective inference: Gibbs and
     Candes, arXiv 2106.00170; Humbert, Gazin, Heller and Roquain, arXiv 2508.10336.
     """
 
