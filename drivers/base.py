@@ -47,11 +47,11 @@ class ElectrodeFault(IntFlag):
 
     NONE = 0
     MISSING = 1
-    """No sample of this electrode arrived in this reading."""
+    """No sample of this electrode arrived in this reading, or no sensor drove the line."""
     NOT_A_COUNT = 2
     """The value is not an integer in 0..4095."""
     PARITY = 4
-    """A byte of the response word has even parity (manual figure 15)."""
+    """A byte of the response word has even parity, or a bit that must be 0 (manual figure 15)."""
     ERROR_WORD = 8
     """The sensor answered with an error word instead of data (manual table 8)."""
     HELD = 16
@@ -76,7 +76,7 @@ class TactileReading(msgspec.Struct, frozen=True, eq=False, gc=False):
     """One sweep over all electrodes of all fingers of a hand."""
 
     t_ns: int
-    """Monotonic time, ns, when the last byte of the reading was received."""
+    """Monotonic time, ns, of the end of the sweep; of its last byte's arrival without a clock."""
     seq: int
     """Number of the reading; one more per reading that the sensor made. A gap is a loss."""
     counts: NDArray[np.uint16]
@@ -91,7 +91,7 @@ class TactileReading(msgspec.Struct, frozen=True, eq=False, gc=False):
 
     @property
     def made_ns(self) -> int:
-        """Time at which the reading was made, ns, to compute intervals. Use `t_ns` for its age."""
+        """Time, ns, for intervals between readings: `recorded_ns`, or else `t_ns`. Not for ages."""
         return self.t_ns if self.recorded_ns is None else self.recorded_ns
 
     def __post_init__(self) -> None:
@@ -300,7 +300,7 @@ class LinkError(DriverError):
 
     @classmethod
     def from_errno(cls, error: BaseException, text: str, endpoint: str | None = None) -> LinkError:
-        """Return an error whose cause follows from the `errno` of `error` or its causes."""
+        """Return an error of the cause that the `errno` of `error` or its causes shows, if any."""
         reason: BaseException | None = error
         while reason is not None:
             cause = _CAUSES.get(getattr(reason, "errno", None))

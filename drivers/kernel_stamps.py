@@ -7,9 +7,9 @@ import struct
 from typing import Final
 
 SO_TIMESTAMPNS: Final = 35
-"""Socket option of Linux, missing in Python's `socket` (asm-generic/socket.h)."""
+"""Linux option to stamp arrivals, missing in Python's `socket` (asm-generic/socket.h)."""
 SO_RXQ_OVFL: Final = 40
-"""Socket option of Linux, missing in Python's `socket` (asm-generic/socket.h)."""
+"""Linux option to count drops, missing in Python's `socket` (asm-generic/socket.h)."""
 TIMESPEC: Final = struct.Struct("@ll")
 """Ancillary data of `SO_TIMESTAMPNS`: wall time, seconds and ns."""
 DROPS: Final = struct.Struct("@I")
@@ -18,7 +18,7 @@ ANCILLARY_BYTES: Final = socket.CMSG_SPACE(TIMESPEC.size) + socket.CMSG_SPACE(DR
 
 
 def read_stamps(ancillary: list[tuple[int, int, bytes]]) -> tuple[int | None, int | None]:
-    """Return the wall time of the arrival, ns, and the sum of drops; None if absent."""
+    """Return wall time of arrival, ns, and drops since the socket was opened; None if absent."""
     wall_ns = drops = None
     for level, kind, data in ancillary:
         if level != socket.SOL_SOCKET:

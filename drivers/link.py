@@ -26,9 +26,9 @@ WARNINGS_MAX = 8
 """Most warnings in one outage, each for another reason; the log cannot fill up."""
 
 CLOCK_STEP_NS: Final = 1_000_000_000
-"""Fall of a sender's time, ns, seen as delay, from which on that time has another zero."""
+"""Apparent delay of a message, ns, from which on a fall of its sender's time is a new zero."""
 LEAP: Final = 10
-"""Ratio to our clock's speed from which on a sender's time was set or is not in seconds."""
+"""Speed of a sender's time, in that of our clock, from which on it was set or is not in seconds."""
 LEAP_NS: Final = 200_000_000
 """Rise of a sender's time that is always allowed, ns, because a delayed message followed by
 losses has such a rise."""
@@ -148,7 +148,8 @@ class SenderClock:
     """Bounds the age of messages by their sender's time, which may have any zero.
 
     The quickest message so far is assumed to have no delay. A delay of all messages, or one that
-    grows by less than 1 ms a second, is not noticed. Time that falls has another zero.
+    grows by less than 1 ms a second, is not noticed. Time that falls, so that the delay seems to
+    be a second or more, has another zero.
     """
 
     def __init__(self) -> None:
@@ -157,9 +158,9 @@ class SenderClock:
         self._sent_ns = self._received_ns = 0
 
     def leaps(self, t_s: float | None, received_ns: int) -> bool:
-        """Return True if the sender's time passed ten times as fast as here since the last message.
+        """Return True if the sender's time rose over ten times as fast as ours since the last one.
 
-        Such a time was set or is not in seconds, so it shows no delay. Leaps of 200 ms pass.
+        Such a time was set or is not in seconds, so it shows no delay. 200 ms more are allowed.
         """
         if t_s is None or self._offset_ns is None:
             return False
@@ -167,7 +168,7 @@ class SenderClock:
         return round(t_s * 1e9) - self._sent_ns > LEAP * passed_ns + LEAP_NS
 
     def made_ns(self, t_s: float | None, received_ns: int) -> int:
-        """Return the latest time at which a message was made, monotonic ns.
+        """Return the latest time at which a message can have been made, monotonic ns.
 
         `t_s`: the sender's time, s; None: not known.
         """

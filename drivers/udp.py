@@ -58,14 +58,14 @@ class Endpoint:
 
 
 def plain(address: str) -> str:
-    """Return an address in the form used to compare senders: no IPv4 in IPv6, no scope."""
+    """Return an address as senders are compared: IPv4 if mapped into IPv6, without scope."""
     parsed = ipaddress.ip_address(address.partition("%")[0])
     mapped = parsed.ipv4_mapped if isinstance(parsed, ipaddress.IPv6Address) else None
     return str(mapped or parsed)
 
 
 class Datagram(NamedTuple):
-    """One datagram."""
+    """A datagram that was received."""
 
     data: bytes
     """Content; one byte longer than the receiver's limit if the datagram was too long."""
@@ -184,7 +184,7 @@ class DatagramDriver(Opened, Generic[Stream]):
     exhausted = False
     live = True
     _fingers: tuple[str, ...] = ()
-    """Fingers whose sensors stand behind the sender."""
+    """Fingers of the sensors whose values the sender reports."""
 
     def __init__(
         self,
@@ -274,7 +274,7 @@ class DatagramDriver(Opened, Generic[Stream]):
         return readings
 
     def _datagrams(self) -> Iterator[tuple[bytes, int]]:
-        """Yield the waiting datagrams, oldest first, with their arrival times, ns."""
+        """Yield the sender's waiting datagrams, oldest first, with their arrival times, ns."""
         if self.link.state is LinkState.CLOSED:
             raise RuntimeError(f"the {self.name} link is not open")
         receiver = self._receiver or self._listen_again()
@@ -307,7 +307,7 @@ class DatagramDriver(Opened, Generic[Stream]):
             self.link.up(self._heard_from, self._clock())
 
     def _fell_silent(self) -> bool:
-        """Return True if the link went down since the last call."""
+        """Take a silent link down; return True if the link went down since the last call."""
         is_up = self.link.state is LinkState.UP
         if is_up and self._clock() - self._good_t_ns >= self.silence_ns:
             silence = f"nothing good for {self.silence_ns / 1e6:.0f} ms"

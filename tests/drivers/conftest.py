@@ -10,7 +10,7 @@ from tests.kit.clock import Clock
 
 @pytest.fixture
 def receiver(monkeypatch: pytest.MonkeyPatch) -> Receiver:
-    """What a driver opens in place of a socket."""
+    """Stand-in that a driver opens in place of a socket."""
     receiver = Receiver()
     monkeypatch.setattr("graspd.drivers.udp.DatagramReceiver", lambda *_: receiver)
     return receiver

@@ -30,12 +30,12 @@ def counts_of(number: int) -> NDArray[np.uint16]:
 
 
 def sweeps_of(number: int) -> list[NDArray[np.uint16]]:
-    """Counts of the first sweeps."""
+    """Counts of the first `number` sweeps."""
     return [counts_of(each) for each in range(number)]
 
 
 def number_in(reading: TactileReading) -> int | None:
-    """The number of a reading's sweep; None if all is flagged. Fails if there are two numbers."""
+    """The number of a reading's sweep; None if all counts are flagged. Fails for two numbers."""
     sound = reading.faults == 0
     assert not reading.counts[~sound].any(), "a flagged electrode has a count"
     places = _PLACES.reshape(sound.shape)[sound]
@@ -50,19 +50,20 @@ def tactile(readings: Iterable[Reading]) -> list[TactileReading]:
 
 @dataclass(frozen=True)
 class Step:
-    """What happens next."""
+    """What happens to the next units of a board."""
 
     what: str
-    """`send`; `lose`; `again`: the last ones come once more; `late`: they come after the next;
+    """`send`; `lose`; `again`: the last ones come once more; `late`: each comes after a later one;
     `stall`: the board pauses; `restart`: it begins again, with all its counters."""
     units: int
-    """How many frames, packets or samples; of a stall, how long in them."""
+    """Number of frames, packets or samples; for a stall, its length as the time of that number."""
 
 
 def plans(sweep: int, steady_sweeps: int = 1) -> st.SearchStrategy[list[Step]]:
-    """Plans for a board of which a sweep takes `sweep` units; at first it sweeps undisturbed.
+    """Plans for a board with `sweep` units in a sweep, the first `steady_sweeps` undisturbed.
 
-    Losses are often of whole sweeps, or nearly: there places agree again though sweeps do not.
+    Losses are often of whole sweeps, or nearly: the next unit then has the expected electrodes,
+    but of another sweep.
     """
     some = st.integers(1, 2 * sweep)
     whole = st.integers(1, 4).map(lambda sweeps: sweep * sweeps)
@@ -93,9 +94,9 @@ def plans(sweep: int, steady_sweeps: int = 1) -> st.SearchStrategy[list[Step]]:
 
 
 def losses(sweep: int) -> st.SearchStrategy[list[Step]]:
-    """Plans that lose and copy units only, of a board whose pace is known.
+    """Plans that lose and repeat units only, after eight undisturbed sweeps.
 
-    What is lost in a row is too little for a link to count as down.
+    Too few are lost in a row for the link to count as down.
     """
     some = st.integers(1, 2 * sweep)
     whole = st.integers(1, 6).map(lambda sweeps: sweep * sweeps)
@@ -120,9 +121,9 @@ class Unit:
     at: int
     """When it comes, in units since the board's first start."""
     index: int
-    """Which one since the board's last start, lost ones too."""
+    """Number of the unit since the board's last start, from 0; lost ones count."""
     boot: int
-    """Which start that was."""
+    """Number of that start, from 0."""
 
 
 def arrivals(plan: Sequence[Step], silent: int, late_max: int = 3) -> Iterator[Unit]:

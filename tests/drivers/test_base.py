@@ -47,7 +47,7 @@ from tests.kit.clock import Clock
         (("lf",), FINGERS, (3,)),
     ],
 )
-def test_a_row_is_where_the_device_has_the_finger(
+def test_each_finger_maps_to_its_sensor_number_at_the_device(
     fingers: tuple[str, ...], sensors: tuple[str, ...] | None, rows: tuple[int, ...]
 ) -> None:
     assert sensor_rows(fingers, sensors) == rows
@@ -57,7 +57,7 @@ def test_a_row_is_where_the_device_has_the_finger(
     ("counts", "faults"),
     [((3, 23), (3, 23)), ((3, 25), (3, 25)), ((24,), (24,)), ((3, 24), (2, 24))],
 )
-def test_a_reading_has_24_electrodes_a_finger(
+def test_counts_or_faults_of_a_wrong_shape_are_refused(
     counts: tuple[int, ...], faults: tuple[int, ...]
 ) -> None:
     assert ELECTRODES == 24
@@ -65,14 +65,14 @@ def test_a_reading_has_24_electrodes_a_finger(
         TactileReading(0, 0, np.zeros(counts, np.uint16), np.zeros(faults, np.uint8))
 
 
-def test_faults_keep_the_bits_that_recordings_hold() -> None:
+def test_fault_bits_have_the_values_stored_in_recordings() -> None:
     assert {fault.name: int(fault) for fault in ElectrodeFault} == {
         **{"MISSING": 1, "NOT_A_COUNT": 2, "PARITY": 4},
         **{"ERROR_WORD": 8, "HELD": 16, "CUT_OFF": 32},
     }
 
 
-def test_recorded_and_live_readings_bear_their_own_times() -> None:
+def test_made_ns_is_the_recorded_time_or_else_t_ns() -> None:
     arrays = np.zeros((1, 24), np.uint16), np.zeros((1, 24), np.uint8)
     assert TactileReading(5, 0, *arrays).made_ns == 5
     assert TactileReading(5, 0, *arrays, recorded_ns=0).made_ns == 0
@@ -88,7 +88,7 @@ def test_recorded_and_live_readings_bear_their_own_times() -> None:
     ],
     ids=["spi", "can", "palm", "joints"],
 )
-def test_a_link_that_is_closed_says_so_and_reads_nothing(
+def test_an_unopened_driver_reports_closed_and_raises_on_reading(
     driver: Driver, name: str, period_ns: int | None, silence_ns: int | None
 ) -> None:
     assert (driver.name, driver.period_ns, driver.live) == (name, period_ns, True)
@@ -103,7 +103,7 @@ def test_a_link_that_is_closed_says_so_and_reads_nothing(
     driver.close()
 
 
-def test_patience_grows_to_a_second_until_the_link_is_up() -> None:
+def test_retry_waits_grow_to_one_second_until_link_is_up() -> None:
     clock = Clock()
     link = Link("spi")
     link.start(clock.now_ns)
@@ -127,7 +127,7 @@ def test_patience_grows_to_a_second_until_the_link_is_up() -> None:
     assert link.retry_ns == clock.now_ns + 50_000_000
 
 
-def test_the_journal_tells_each_reason_once_an_outage(caplog: pytest.LogCaptureFixture) -> None:
+def test_each_reason_is_logged_once_per_outage(caplog: pytest.LogCaptureFixture) -> None:
     link = Link("spi")
     with caplog.at_level(logging.DEBUG):
         link.start(2_000_000_000)
@@ -152,7 +152,7 @@ def test_the_journal_tells_each_reason_once_an_outage(caplog: pytest.LogCaptureF
     ]
 
 
-def test_reasons_that_never_repeat_do_not_fill_the_journal(
+def test_at_most_eight_reasons_per_outage_are_warnings(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     link = Link("spi")
@@ -212,7 +212,7 @@ def test_a_count_has_the_word_of_the_manual() -> None:
     assert not faults.any()
 
 
-def test_an_error_word_never_becomes_a_reading() -> None:
+def test_an_error_word_never_becomes_a_count() -> None:
     codes = {0xA52D, 0xA558, 0xA552, 0xA545, 0xA53F, 0xA52E, 0xA55F, 0xA557}
     assert set(ERROR_WORDS) == codes
     counts, faults = decode_words(words(*codes))
@@ -220,13 +220,13 @@ def test_an_error_word_never_becomes_a_reading() -> None:
     assert not counts.any()
 
 
-def test_a_line_that_nothing_drives_is_a_missing_sensor() -> None:
+def test_words_of_an_undriven_line_are_flagged_missing() -> None:
     counts, faults = decode_words(words(0x0000, 0xFFFF))
     assert faults.tolist() == [ElectrodeFault.MISSING] * 2
     assert not counts.any()
 
 
-def test_every_count_and_no_damaged_bit_survives_the_way() -> None:
+def test_every_count_decodes_and_any_single_bit_error_is_flagged() -> None:
     _, faults = decode_words(np.arange(1 << 16, dtype=np.uint16))
     assert (faults == 0).mean() == 0.0625
     good = words(*(encode_word(count) for count in range(4096)))

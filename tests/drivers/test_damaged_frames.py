@@ -59,7 +59,7 @@ FRAMES = st.tuples(
 
 @settings(max_examples=300)
 @given(st.data(), FRAMES, FRAMES)
-def test_a_damaged_bridge_frame_hides_no_next_one(
+def test_the_frame_after_a_damaged_bridge_frame_is_found(
     data: st.DataObject, frame: tuple[int, bytes], other: tuple[int, bytes]
 ) -> None:
     good, wire = (encode_frame(*each, DIGEST) for each in (frame, other))
@@ -75,7 +75,7 @@ def test_a_damaged_bridge_frame_hides_no_next_one(
 
 @st.composite
 def spoilt(draw: st.DrawFn) -> tuple[int, dict[int, bytes]]:
-    """Draw a kind of palm, and what some of its packets become."""
+    """Draw a kind of palm, and damaged packets of it by their place in `PACKETS`."""
     kind = draw(st.integers(0, len(PACKETS) - 1))
     places = draw(st.lists(st.integers(14, 41), min_size=1, max_size=3, unique=True))
     packets = PACKETS[kind]
@@ -87,7 +87,7 @@ def spoilt(draw: st.DrawFn) -> tuple[int, dict[int, bytes]]:
 def test_a_damaged_palm_packet_gives_no_impossible_count(
     spoilt: tuple[int, dict[int, bytes]],
 ) -> None:
-    """Packets have no checksum: one whose damage leaves it plausible is a packet."""
+    """Packets have no checksum, so one that still looks right after damage is read."""
     kind, changes = spoilt
     stream, readings = PalmStream(FINGERS), 0
     for cycle, good in enumerate(PACKETS[kind]):

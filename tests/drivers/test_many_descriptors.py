@@ -1,4 +1,4 @@
-"""Serial links, ours and python-can's, work again after a loss among 2,000 descriptors."""
+"""Serial links, ours and python-can's, work again after a loss while 2,000 files are open."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def slcan(folder: Path) -> Iterator[Bench]:
 
 
 @pytest.mark.parametrize("bench", [spi, slcan], ids=lambda bench: bench.__name__)
-def test_a_driver_reads_again_above_descriptor_1024(
+def test_a_driver_reconnects_on_a_descriptor_above_1024(
     bench: Callable[[Path], contextlib.AbstractContextManager[Bench]], tmp_path: Path
 ) -> None:
     with bench(tmp_path) as (driver, send, unplug, plug):

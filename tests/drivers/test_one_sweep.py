@@ -1,7 +1,7 @@
-"""Each link's assembler: no reading mixes sweeps, none is newer than it says, no loss is hidden.
+"""Each link's assembler: no reading mixes sweeps, none looks newer than it is, no loss is hidden.
 
-What boards must number and how long links may hold frames back, so that this holds, say
-`deploy/bridge/PROTOCOL.md`, `deploy/can/PROTOCOL.md` and, of palms, `deploy/CONNECT.md`.
+`deploy/bridge/PROTOCOL.md`, `deploy/can/PROTOCOL.md` and, for palms, `deploy/CONNECT.md` say what
+boards must number and how long links may hold frames back, so that this holds.
 """
 
 from __future__ import annotations
@@ -55,27 +55,27 @@ WORDS = [word(count) for count in range(4096)]
 PACKETS = [
     packet.to_bytes() for packet in PalmTwin(counts_of(number) for number in range(600)).packets()
 ]
-"""More rounds than the longest plan has."""
+"""Packets of a palm, in more rounds than the longest plan has."""
 SEQ_FIRST = (1 << 32) - 9
 """Number of a bridge's first sweep, soon before it wraps."""
 SWEEPS_PER_BOOT = 700
-"""Numbers apart are the sweeps of two starts of a board."""
+"""Number that each restart of a board adds to the numbers of its sweeps."""
 
 Feed = Callable[[Unit, int, int], Sequence[Reading]]
-"""A driver that takes a unit, of a sweep of this number, at this time in ns."""
+"""Function that gives a driver a unit, of the sweep of this number, at this time in ns."""
 Link = tuple[Feed, DriverCounters]
 COPIES = ("duplicates", "duplicate_frames", "duplicate_packets", "old_messages")
-"""Names of the counter of copies."""
+"""Names by which the links count repeated units."""
 
 
 def words_of(number: int) -> NDArray[np.uint16]:
-    """Words of a sweep, shape (24, 3)."""
+    """Response words of a sweep, shape (24, 3)."""
     words = [[int.from_bytes(WORDS[count]) for count in row] for row in counts_of(number).T]
     return np.array(words, dtype=np.uint16)
 
 
 def sample(number: int, slot: int, channels: Sequence[int]) -> CanFrame:
-    """One channel of three sensors, in the order of a sequence."""
+    """The frame of a slot: one channel of three sensors. `channels`: the sampling sequence."""
     channel = channels[slot % len(channels)]
     words = WORDS[2050] * WIDTH
     if channel >= E1:
@@ -107,7 +107,7 @@ def samples(sequence: str) -> Callable[[], Link]:
 
 
 def bus_log() -> Link:
-    """Through the lines of a log, which must give the readings of the bus."""
+    """A CAN link through the lines of a log, which must give the readings of the bus."""
     log = CanLog([Path("bus.log")], FINGERS, arbitration_id=BASE_ID, sequence="electrodes")
 
     def feed(unit: Unit, number: int, t_ns: int) -> Sequence[Reading]:
@@ -129,7 +129,7 @@ def spi_sweep(unit: Unit, number: int) -> bytes:
 
 
 def bridge() -> Link:
-    """Through a conversation."""
+    """A serial link through a `Conversation`."""
     conversation = greeted()
 
     def feed(unit: Unit, number: int, t_ns: int) -> Sequence[Reading]:
@@ -142,7 +142,7 @@ def bridge() -> Link:
 
 
 def bridge_log() -> Link:
-    """Through the records of a log, which must give the readings of the line."""
+    """A serial link through the records of a log, which must give the readings of the line."""
     log = SerialLog([Path("line.serial")], FINGERS)
 
     def play(event: LineEvent, data: bytes, t_ns: int) -> list[Reading]:
@@ -171,19 +171,19 @@ def messages() -> Link:
 
 @dataclass(frozen=True)
 class Assembler:
-    """A link whose driver assembles sweeps of units."""
+    """A link whose driver assembles sweeps from units."""
 
     begin: Callable[[], Link]
     places: Sequence[Sequence[int]]
     """Electrodes, from 0, of each unit of a sweep."""
     silent: int
-    """Units that a board is silent after a start."""
+    """Time, in units, for which a board is silent after a restart."""
     unit_ns: int = MS
     start_ns: int = T0 + 10 * MS
     age_ns: int = 0
-    """Most by which a reading is older than its last unit."""
+    """Most by which a reading's time is before the arrival of its last unit."""
     boot_units: int | None = None
-    """Units that a start of the board leaves out; None: `SWEEPS_PER_BOOT` sweeps."""
+    """Units that each restart of the board skips; None: those of `SWEEPS_PER_BOOT` sweeps."""
     examples: int = 80
     steady_sweeps: int = 1
     """Undisturbed sweeps at the beginning."""
@@ -199,13 +199,13 @@ class Assembler:
 
 ALL = [range(24)]
 PALM_SHIFT = 37
-"""Packets: a relay that starts again does so within a round."""
+"""Packets that a restart of the relay skips; it starts again within a round."""
 PAIRS = [[], [0], *([first, first + 1] for first in range(1, 22, 2)), [23]]
 """Electrodes of each request of a round (tactile_data_type 0x0001, 0x0003 ... 0x001B)."""
 
 
 def of_samples(sequence: str) -> Assembler:
-    """A board without a pause, of which two sweeps in a row have come."""
+    """A board on a CAN bus that samples a sequence without a pause between sweeps."""
     channels = SEQUENCES[sequence]
     places = [[channel - E1] if channel >= E1 else [] for channel in channels]
     begin, silent = samples(sequence), len(channels)
@@ -230,7 +230,7 @@ ASSEMBLERS = {
 
 
 @pytest.mark.parametrize("name", ASSEMBLERS)
-def test_no_reading_mixes_two_sweeps_or_is_newer(name: str) -> None:
+def test_no_reading_mixes_two_sweeps_or_looks_too_new(name: str) -> None:
     assembler = ASSEMBLERS[name]
 
     @settings(max_examples=assembler.examples, derandomize=True)
@@ -254,14 +254,14 @@ def test_no_reading_mixes_two_sweeps_or_is_newer(name: str) -> None:
 
 @dataclass
 class Came:
-    """What came of a sweep."""
+    """Units and electrodes of a sweep that have arrived."""
 
     units: set[int] = field(default_factory=set)
     places: set[int] = field(default_factory=set)
     end_ns: int = 0
-    """When the last of these places came."""
+    """When the last new unit with electrodes came."""
     given_ns: int = 0
-    """When its reading was given."""
+    """When the driver returned the sweep's reading."""
 
 
 @pytest.mark.parametrize("name", ASSEMBLERS)
@@ -317,7 +317,7 @@ def test_each_loss_flags_its_electrodes_and_no_others(name: str) -> None:
 
 @settings(max_examples=60)
 @given(plans(1))
-def test_joint_messages_are_whole_and_never_go_back(
+def test_joint_readings_mix_no_messages_and_never_go_back(
     plan: list[Step],
 ) -> None:
     stream = JointStream()

@@ -1,4 +1,4 @@
-"""TOML is read as `tomllib` reads it; what would cost more than its size says is not read."""
+"""TOML is read as by `tomllib`, but refused where nested so deeply that it would cost much."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ HIDDEN = {
     "quotes at the end": '"""x"""""',
     "six quotes": '""""""',
 }
-"""Where a reader that takes strings or comments for something else would lose its way."""
+"""Strings and a comment that a careless reader would end at the wrong place."""
 
 
 @pytest.mark.parametrize("how", NESTING)
-def test_eight_levels_are_read_and_nine_are_not(how: str) -> None:
+def test_eight_levels_of_nesting_are_read_and_nine_refused(how: str) -> None:
     text = "x.y = 1\n" + NESTING[how](6 if how == "inline key" else 8)
     assert toml.loads(text) == tomllib.loads(text)
     with pytest.raises(toml.NestedTooDeeplyError):
@@ -56,7 +56,7 @@ def test_dots_and_brackets_in_values_do_not_nest(text: str) -> None:
 
 
 @pytest.mark.parametrize("before", HIDDEN)
-def test_no_string_or_comment_hides_what_nests(before: str) -> None:
+def test_deep_nesting_after_a_string_or_comment_is_refused(before: str) -> None:
     first = HIDDEN[before] if before == "a comment" else f"first = {HIDDEN[before]}"
     text = f"{first}\n{NESTING['arrays'](40)}"
     try:

@@ -37,7 +37,7 @@ class Bench:
         self.counters = self.link.stream.counters
 
     def hear(self, *sent: Datagram) -> list[int]:
-        """Return the ages of the readings of these datagrams, ns."""
+        """Let these datagrams arrive; return the ages of their readings, ns."""
         self.sockets[0].waiting += sent
         return [self.clock.now_ns - reading.t_ns for reading in joints(self.link.read_ready())]
 
@@ -55,7 +55,7 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
     return Bench(monkeypatch)
 
 
-def test_the_first_good_sender_holds_until_silent(bench: Bench) -> None:
+def test_the_first_good_sender_is_the_only_one_until_silent(bench: Bench) -> None:
     assert bench.hear(Datagram(b"x", 0, THERE)) == []
     assert bench.link.link.state is LinkState.GREETING
     assert bench.hear(Datagram(GOOD, 0, HERE), Datagram(GOOD, 0, THERE)) == [0]
@@ -116,7 +116,7 @@ def test_only_from_compares_addresses_and_not_their_spelling(
         assert driver.counters.foreign_datagrams == (not is_heard)
 
 
-def test_a_datagram_is_as_old_as_the_kernel_says(bench: Bench) -> None:
+def test_readings_have_their_datagrams_ages_and_never_go_back(bench: Bench) -> None:
     sent = [Datagram(GOOD, age_ns, HERE) for age_ns in (5, 7, 2)]
     assert bench.hear(*sent) == [5, 5, 2]
 
@@ -137,7 +137,7 @@ def test_silence_is_noticed_when_it_is_due_and_once(bench: Bench) -> None:
     assert bench.link.due_ns() is None
 
 
-def test_what_the_kernel_dropped_is_summed_over_the_sockets(bench: Bench) -> None:
+def test_kernel_drops_are_summed_over_reopened_sockets(bench: Bench) -> None:
     first, second = bench.sockets
     bench.hear(Datagram(GOOD, 0, HERE))
     assert bench.counters.kernel_drops == 3
@@ -164,8 +164,8 @@ def test_at_most_256_datagrams_are_taken_at_once(bench: Bench) -> None:
     assert len(bench.hear()) == 300 - 256
 
 
-def test_a_socket_keeps_128_kilobytes() -> None:
-    """0.2 s of palm packets; the kernel gives what it gives to others that ask for as much."""
+def test_a_receive_buffer_of_128_kibibytes_is_requested() -> None:
+    """0.2 s of palm packets; the kernel gives as much to any socket that requests the same."""
     receiver = DatagramReceiver(Endpoint("127.0.0.1", 0), 100)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 131_072)
@@ -251,7 +251,7 @@ SOL, STAMP, LOST = socket.SOL_SOCKET, 35, 40
         ([], 0, 0),
     ],
 )
-def test_age_and_losses_are_what_the_kernel_notes(
+def test_age_and_drops_come_from_valid_kernel_stamps(
     monkeypatch: pytest.MonkeyPatch,
     notes: list[tuple[int, int, bytes]],
     age_ns: int,
@@ -265,7 +265,7 @@ def test_age_and_losses_are_what_the_kernel_notes(
 
 
 @pytest.mark.parametrize(("step_ms", "age_ms"), [(-350, 450), (350, 450), (2, 252)])
-def test_a_wall_clock_that_steps_makes_nothing_younger(
+def test_a_step_of_the_wall_clock_makes_no_datagram_younger(
     monkeypatch: pytest.MonkeyPatch, step_ms: int, age_ms: int
 ) -> None:
     """A stall of 450 ms; the datagram came after 200 ms of it. A change of 2 ms is not a step."""
@@ -280,13 +280,15 @@ def test_a_wall_clock_that_steps_makes_nothing_younger(
     assert ages == [age_ms * 1_000_000] * 2
 
 
-def test_a_datagram_that_is_too_long_shows_by_one_byte(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_overlong_datagram_is_cut_to_limit_plus_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     receiver, _ = noted(monkeypatch, (bytes(100), []), (bytes(500), []), (b"a", []))
     assert [len(datagram.data) for datagram in receiver.receive(2)] == [100, 101]
     assert len(list(receiver.receive(3))) == 1
 
 
-def test_an_interrupted_receive_is_repeated_an_error_breaks_the_link(
+def test_an_interrupted_receive_is_repeated_but_an_error_raises(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     broken = OSError(100, "Network is down")

@@ -11,7 +11,7 @@ HERE, THERE = ("127.0.0.1", 7), ("127.0.0.1", 8)
 
 
 class Receiver:
-    """A socket that hands over what a test puts in, and breaks when there is an exception."""
+    """Stand-in for `DatagramReceiver`: yields what a test puts in `waiting`, raises its errors."""
 
     port = 5700
 
@@ -21,7 +21,7 @@ class Receiver:
         self.closed = False
 
     def send(self, *datagrams: bytes, sender: tuple[str, int] = HERE) -> None:
-        """Let datagrams come in at the time at which they are read."""
+        """Put in datagrams that arrive, with age 0, when they are read."""
         self.waiting += [Datagram(data, 0, sender) for data in datagrams]
 
     def receive(self, most: int) -> Iterator[Datagram]:
