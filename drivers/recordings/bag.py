@@ -86,9 +86,9 @@ class BagCounters(DriverCounters):
     """Counters of a replay."""
 
     repeats: int = 0
-    """Messages with the time or the counts of the one before; dropped."""
+    """Messages with the counts of the one before, or its time or up to 1 s less; dropped."""
     malformed: int = 0
-    """Messages without five sensors."""
+    """Messages without five sensors that each have 24 electrodes or none; dropped."""
 
 
 class BagDriver(ReadingsDriver[Reading]):
@@ -194,7 +194,10 @@ class _Bag:
         self.joints = self._choose(JOINTS)
 
     def _choose(self, kind: str) -> Connection | None:
-        """Return the topic of this type: of several the right hand's, or else the shortest."""
+        """Return the connection of this message type; None if the bag has none.
+
+        The first of several topics is `/joint_states`, then the right hand's, then the shortest.
+        """
         found = [each for each in self._reader.connections if each.msgtype == kind]
         found.sort(key=lambda each: (not each.topic.startswith("/rh/"), len(each.topic)))
         if kind == JOINTS:
@@ -247,7 +250,7 @@ def _opened(path: Path) -> Iterator[_Bag]:
 
 
 def _reader_of(path: Path) -> Any:  # noqa: ANN401
-    """Return a reader of a ROS 2 bag. rosbags itself goes by the suffix of the file."""
+    """Return a reader of a ROS 2 bag by its content; rosbags itself goes by the file's suffix."""
     if path.is_dir():
         return rosbag2.Reader(path)
     with path.open("rb") as file:
@@ -304,10 +307,10 @@ def _element(field: Any) -> str:  # noqa: ANN401
 
 
 def sensors_of(path: Path, message: Any) -> NDArray[np.int64] | None:  # noqa: ANN401
-    """Return the electrodes of a message, shape (5, 24), in the order of `FINGERS`.
+    """Return the electrodes' values in a message, shape (5, 24), in the order of `FINGERS`.
 
     An absent sensor may have no electrodes, which are 0 here. None if the message is malformed.
-    Raises `RecordingError` for another sensor.
+    Raises `RecordingError` for the former BioTac, which has 19 electrodes.
     """
     electrodes = [
         each.electrodes if len(each.electrodes) else np.zeros(ELECTRODES)
@@ -322,7 +325,10 @@ def sensors_of(path: Path, message: Any) -> NDArray[np.int64] | None:  # noqa: A
 
 
 def fingers_of(path: Path) -> tuple[Finger, ...]:
-    """Return the fingers with a sensor; an absent sensor has values at a rail, or no counts."""
+    """Return the fingers with a sensor. Raises `RecordingError` if there is none.
+
+    An absent sensor has no values, or most of them at a rail: 0 or below, 4095 or above.
+    """
     seen = np.zeros(len(FINGERS), dtype=np.intp)
     number = 0
     with _opened(path) as bag:

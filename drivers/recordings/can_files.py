@@ -48,7 +48,7 @@ _TRC_OTHERS: Final = re.compile(
 
 
 def read_asc(lines: Iterable[str]) -> Iterator[Line]:
-    """Yield frames of an ASC file, and lines that were not understood."""
+    """Yield frames of an ASC file, and lines that were not understood or have a relative time."""
     base, is_relative = "hex", False
     for number, text in enumerate(lines, 1):
         if head := _ASC_BASE.match(text.strip()):
@@ -115,7 +115,7 @@ def _message(
 
 def _logged(message: can.Message | None, text: str, first_channel: int = 0) -> Logged | None:
     """Return the frame of a message; None if it differs from its line or is incomplete. `text`: the
-    line, if it has the data in hexadecimal digits."""
+    line, or empty if its data is not in hexadecimal digits. `first_channel`: number of `can0`."""
     if message is None or not isinstance(message.channel, int):
         return None
     t_ns, bus = round(message.timestamp * NS_PER_S), f"can{message.channel - first_channel}"
@@ -146,7 +146,7 @@ def _is_classic(text: str, data_bytes: int) -> bool:
 
 
 class _Lines:
-    """Lines in the form of the text file that python-can reads."""
+    """Lines as an open text file, as python-can's readers take it."""
 
     def __init__(self, lines: Iterable[str]) -> None:
         self._lines = iter(lines)
@@ -162,7 +162,7 @@ class _Lines:
 
 
 class _Pieces:
-    """A file whose reads are limited, whatever length a piece of it claims to have."""
+    """A file that raises `ValueError` for reads of more than `PIECE_BYTES_MAX` bytes."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream

@@ -1,4 +1,4 @@
-"""The logs of CAN buses as a driver, and the frames of a link as lines of `candump -L`."""
+"""Driver that plays logs of CAN buses, and frames of a live link as lines of `candump -L`."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def line_of(frame: CanFrame, wall_ns: int, channel: str) -> str:
 
 
 def encode_frames(frames: Sequence[Stamped], offset_ns: int, channel: str) -> bytes:
-    """Return frames as lines; `offset_ns`: wall time less monotonic time."""
+    """Return frames, without losses, as lines; `offset_ns`: wall time less monotonic time."""
     lines = [
         line_of(frame, max(until_ns + offset_ns, 0), channel)
         for frame, _, until_ns in frames
@@ -248,7 +248,7 @@ class CanLog(LinkLogDriver[CanFrame]):
             _log.warning(text, path, strange, lines, first)
 
     def _going_on(self, t_ns: int) -> int:
-        """Return `t_ns`, raised so that it never falls where the log's clock was set back."""
+        """Return `t_ns`, raised so that a log's clock set back by over 1 s is a pause of 1 s."""
         t_ns += self._shift_ns
         if t_ns < self._last_ns - SET_BACK_NS:
             self._shift_ns += self._last_ns + SET_BACK_NS - t_ns

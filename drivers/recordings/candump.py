@@ -66,7 +66,7 @@ class Logged(NamedTuple):
     """Time by the log's clock, ns; None: the same as that of the frame before."""
     bus: str
     frame: CanFrame | None
-    """Classic frame; None: a CAN FD frame."""
+    """Classic frame; None: a CAN FD frame, or on `NO_BUS` no frame."""
     may_be_step: bool = False
     """True if the time may count from the frame before."""
 
@@ -83,7 +83,7 @@ def read_candump(lines: Iterable[str]) -> Iterator[Line]:
 
 
 def parse(text: str) -> Logged | None:
-    """Return the frame in a line; None if candump writes no such line."""
+    """Return the frame in a line, `LOST` for a line of drops; None if candump never writes it."""
     if "\x1b" in text:
         text = _COLOUR.sub("", text)
     found = _LINE.fullmatch(text)

@@ -35,9 +35,9 @@ class Cells:
     """The header of a file, and its rows. Iterate once.
 
     Lines that are blank or begin with `#` are not rows, and empty cells after those of the header
-    are left out. Above the header may be titles and comments, of which it may be the last; fingers
-    may stand above their electrodes, and units below. The constructor and iterating raise
-    `RecordingError`.
+    are left out. Titles and comments may stand above the header, which may be the last comment
+    itself; fingers may stand above their electrodes, and units below. The constructor and
+    iterating raise `RecordingError`.
     """
 
     def __init__(self, path: Path, file: BinaryIO) -> None:

@@ -43,7 +43,7 @@ and the last one is for a single finger."""
 
 ONE_ROW: Final = "put all fingers into one row, as ff_e1 and mf_e1"
 HEADER_ELECTRODES_MIN: Final = 12
-"""Fewest electrodes by which a line below others is the header: half of a finger's."""
+"""Fewest names of electrodes in a line that make it the header: half of a finger's."""
 _PLACES: Final[Mapping[str, int]] = {finger: place for place, finger in enumerate(FINGERS)}
 _UNIT_S: Final = {
     **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), 1.0),
@@ -108,11 +108,12 @@ class Columns:
     object: int | None
     slipped: int | None
     ignored: tuple[str, ...]
-    """Columns of unknown names; electrodes of other fingers do not count."""
+    """Columns of unknown names; electrodes of fingers that are not read are not among them."""
     fingers: tuple[Finger, ...]
     """Fingers that the file has, asked for or not."""
     finger: tuple[int, str] | None
-    """Place and name of a column that may say of which finger a row is, of electrodes of one."""
+    """Place and name of a column that may name the finger of each row, in a file whose electrodes
+    are of one finger; else None."""
     names_finger: bool
     """True if the names of the electrodes have a finger, as `ff_e1`."""
 
@@ -160,7 +161,7 @@ class Columns:
 
 
 def has_electrodes(names: Sequence[str]) -> bool:
-    """Return True for a header with electrodes of some scheme.
+    """Return True if at least `HEADER_ELECTRODES_MIN` names are of electrodes, as in a header.
 
     A title may name one, as may a row of a table that has a row for each electrode.
     """
@@ -223,7 +224,7 @@ def _whole(
     line: int,
     finger_column: tuple[int, str] | None,
 ) -> dict[str, dict[int, int]]:
-    """Return the electrodes by number from 0; raise if a requested finger lacks some."""
+    """Return `found` with numbers from 0; raise if a finger that is read lacks electrodes."""
     base = min(1, *(min(numbers) for numbers in found.values()))
     is_named = found.keys() <= _PLACES.keys()
     for finger in fingers if fingers and is_named else found:
@@ -287,7 +288,7 @@ def _nearest(names: Sequence[str]) -> str:
 
 
 def time_column(names: Sequence[str]) -> TimeColumn | None:
-    """Return the column of times: `t`, else the first with a usual name, or in a unit of time."""
+    """Return the column of times: `t`, else the first of a usual name or unit; None: none."""
     found = [(place, match) for place, name in enumerate(names) if (match := _is_time(name))]
     found = found or [
         (place, match) for place, name in enumerate(names) if (match := _IN_UNIT.fullmatch(name))

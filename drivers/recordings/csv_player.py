@@ -77,9 +77,9 @@ class ReplayDriver(ReadingsDriver[tuple[Row, bool]]):
         strict: bool = False,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """`layouts`: layout of each file, if known. `speed`: factor of real time; None: fast.
-        `rate_hz`: rows per second of a file without times; a table has 100. `read_as`, `rate_hz`:
-        see `layout_of`."""
+        """`layouts`: layout of each file, if known. `speed`: factor of real time; None: as fast as
+        possible. `rate_hz`: rows per second of a file without times; None: 100 for a table.
+        `read_as`, `rate_hz`: see `layout_of`. `loop`: start again after the last file."""
         super().__init__(paths, fingers, speed=speed, clock=clock)
         self._table_period_ns = _NS_PER_S / (rate_hz or TABLE_RATE_HZ)
         self._find = partial(layout_of, fingers=self._fingers, read_as=read_as, rate_hz=rate_hz)
@@ -119,7 +119,7 @@ class ReplayDriver(ReadingsDriver[tuple[Row, bool]]):
         return [self.hand_over(reading, at_ns) for reading in made]
 
     def _items(self) -> Generator[tuple[int, tuple[Row, bool]], None, None]:
-        """Yield the rows of all files on one time axis; True: another stream begins."""
+        """Yield times, ns, and rows of all files on one time axis; True: another stream begins."""
         start_ns = 0
         while True:
             for path in self.paths:

@@ -45,7 +45,7 @@ class Row:
     """Time of the row, s, never lower than before; None for a table."""
     joint_names: tuple[str, ...]
     position_rad: NDArray[np.float64]
-    """Shape (joints,), radians; NaN where the file has no angle."""
+    """Shape (joints,), radians; NaN where the file has no possible angle."""
 
 
 class Recording:
@@ -57,7 +57,7 @@ class Recording:
 
     A count is an integer in 0..4095 in ASCII digits: `2602`, `2602.0` or `2.602e3`. A last row
     without a line end may be cut off within a value, so all its electrodes are faulty and its
-    angles NaN.
+    angles NaN. With `strict` such a row raises, as does a value that is not an angle.
     """
 
     def __init__(
@@ -118,7 +118,7 @@ class Recording:
         return np.array(counts, dtype=np.uint16).reshape(self._shape), faults
 
     def _unusual(self, text: str, place: int, faults: NDArray[np.uint8]) -> int:
-        """Return the count in a cell of unusual text; else 0, and set the fault at `place`."""
+        """Return the count in a cell of unusual text; if none, raise or flag `place`, return 0."""
         count = count_of(text, decimal_comma=self._comma)
         if count is not None:
             return count

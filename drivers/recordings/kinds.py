@@ -59,7 +59,7 @@ BAGS: Final = frozenset((Kind.ROS1_BAG, Kind.ROS2_BAG))
 _GZIP: Final = b"\x1f\x8b\x08"
 _MCAP: Final = b"\x89MCAP0\r\n"
 _MCAP_ROS2: Final = _MCAP + b"\x01", b"\x04\x00\x00\x00ros2"
-"""First bytes of a file, and of its profile after the length of the header record."""
+"""First bytes of a ROS 2 bag in MCAP, and those of its profile, from byte 17 on."""
 _MAGIC: Final = {
     b"PAR1": Kind.PARQUET,
     _MCAP: Kind.MCAP,
@@ -124,7 +124,7 @@ _OTHERS: Final = {
     b"header:": "what `rostopic echo` shows: take `rostopic echo -p`, or a bag",
     _GZIP: "packed twice: unpack it first",
 }
-"""Other files, by their first bytes."""
+"""Text on files that are not read, for people, by their first bytes."""
 
 
 def kind_of(path: Path) -> Kind:
@@ -285,7 +285,7 @@ class Unpacked(io.RawIOBase):
 
 @contextmanager
 def files_of(paths: Sequence[Path]) -> Iterator[list[Path]]:
-    """Yield `paths` with copies in place of `-` and pipes, which can be read only once.
+    """Yield `paths` with temporary copies in place of `-` and pipes, which are read only once.
 
     Raises `RecordingError` for more than `COPIED_BYTES_MAX`.
     """

@@ -1,5 +1,5 @@
 """Decide whether a file is a table of grasps or a stream of sweeps, by times or by its rows. A
-sweep of a stream is never judged as a grasp, so doubt is refused."""
+sweep of a stream is never judged as a grasp, so a doubtful file is refused."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ ReadAs = Literal["table", "stream"]
 BLOCK_ROWS: Final = 512
 """Number of rows that are compared with each other, and of first rows that are checked."""
 CLIP_COUNTS: Final = 64.0
-"""Largest difference of one electrode that counts, because a broken one may have any value."""
+"""Limit of one electrode's difference, counts: larger ones count as this, as of a broken one."""
 NEAR_COUNTS: Final = 8.0
 """Largest root mean square difference, counts, of rows that nearly repeat each other.
 
@@ -49,13 +49,13 @@ ALIKE_SHARE_MAX: Final = 0.85
 `NEAR_COUNTS` count twice. In noisy streams up to 100 % are within the former, none in the latter.
 """
 DOUBTED_SHARES: Final = 0.1, 0.6
-"""The same two shares for rows without outcomes of both kinds, which may be sweeps.
+"""These two limits for rows with neither outcomes of both kinds nor `read_as`.
 
-With 12 sweeps at 4 Hz, 2 % of pieces are below these shares, and 22 % below those above. With 12
-published grasps, 20 % of pieces in a row are above these shares, and under 1 % of random ones.
+In pieces of 12 sweeps at 4 Hz, 2 % are below these limits, and 22 % below those above. In pieces of
+12 published grasps in a row, 20 % are above these limits, and under 1 % of random ones.
 """
 FEW_ROWS: Final = 10
-"""Fewest rows whose shares can refuse a table for good."""
+"""Fewest rows by which a file can be refused as what `read_as` says."""
 MIDDLE_SHARE_MAX: Final = 0.1
 """Largest share of rows neither near nor far, in a table with several readings of each grasp. Such
 tables have up to 5 %, streams 35 to 45 %."""
@@ -68,7 +68,7 @@ STEP_S: Final = (0.002, 0.5)
 SLOWEST_S: Final = 1.0
 """Time between rows, s, from which on they may be grasps."""
 BACK_SHARE_MAX: Final = 0.1
-"""Largest share of rows of a stream that go back in time; it ends at the first of them."""
+"""Largest share of rows of a stream that go back in time; reading fails at the first of them."""
 EPOCHS: Final = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
 """Smallest number of a time since 1970 in each unit, and that unit, s."""
 
@@ -85,7 +85,7 @@ class Layout:
     """Sweeps per second, in place of times."""
 
     has_outcomes: bool = False
-    """True if outcomes of lifts are known; for a table, in some of its first rows."""
+    """True for a stream with a column of outcomes, or a table with some in its first rows."""
 
     @property
     def joints(self) -> Mapping[str, int]:
@@ -101,7 +101,8 @@ def layout_of(
 ) -> Layout:
     """Return the layout of a file; `fingers`: those to read, none for all that it has.
 
-    `read_as` and `rate_hz` decide doubtful cases. Raises `RecordingError`.
+    `read_as`: what the rows are; None: find out. `rate_hz`: sweeps per second of a stream, in place
+    of times. Raises `RecordingError`, also in doubt.
     """
     with open_recording(path) as file:
         return survey(path, file, fingers, read_as, rate_hz)
@@ -197,7 +198,7 @@ class _Rows:
                 raise RecordingError(self.path, problem)
 
     def is_timed(self, read_as: ReadAs | None, rate_hz: float | None) -> bool:
-        """Return True for rows with times. Raises if `read_as` says so, and they have none."""
+        """Return True for a stream, by `read_as`, else by times. Raises without times or rate."""
         if read_as == "stream" and self.columns.time is None and rate_hz is None:
             raise RecordingError(self.path, "has no column of times: give --rate-hz too")
         return read_as == "stream" or (read_as is None and self.columns.time is not None)
@@ -209,7 +210,7 @@ class _Rows:
         return any(is_outcome(row[place]) for row in self.first)
 
     def are_labelled(self) -> bool:
-        """Return True for rows that each have an object and an outcome, of both kinds."""
+        """Return True if each first row has an object and an outcome, and both outcomes occur."""
         name, slipped = self.columns.object, self.columns.slipped
         if name is None or slipped is None:
             return False
@@ -310,7 +311,7 @@ def _timed(rows: _Rows, column: TimeColumn, read_as: ReadAs | None) -> Layout:
 
 
 def are_labelled(cells: Iterable[tuple[str, str]]) -> bool:
-    """Return True for rows that each have an object and an outcome, of both kinds."""
+    """Return True if each pair is an object and an outcome, and both outcomes occur."""
     outcomes = set[str]()
     for name, outcome in cells:
         if not name.strip() or not is_outcome(outcome):

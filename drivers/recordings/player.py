@@ -17,7 +17,7 @@ Item = TypeVar("Item")
 
 
 class RecordedDriver(Opened, Generic[Item]):
-    """Base of drivers that play items of known times at any speed. Times: ns, recording's clock.
+    """Base of drivers that play items at any speed. Times of items: ns, recording's clock.
 
     The run begins when the first item is requested. Items are read one ahead, so that reading
     does not add to their age. An error is raised once the items before it are taken.
@@ -70,7 +70,7 @@ class RecordedDriver(Opened, Generic[Item]):
             self._playing = None
 
     def due_ns(self) -> int | None:
-        """Return when the next item is due, ns; a time in the past means now. None: no item."""
+        """Return when the next item is due, monotonic ns; the past means now. None: no item."""
         if self._playing is None or self.exhausted:
             return None
         if self.speed is None or self._next is None or self._began is None:
@@ -83,7 +83,7 @@ class RecordedDriver(Opened, Generic[Item]):
         return began_ns + round((at_ns - first_ns) / (self.speed or 1.0))
 
     def take(self) -> tuple[int, Item] | None:
-        """Return time, ns, and content of a due item. Raises `RecordingError`."""
+        """Return time, ns, and content of the next item; None: not due. Raises `RecordingError`."""
         if self._playing is None:
             raise RuntimeError("the replay is not open")
         now_ns, item = self._clock(), self._next
@@ -101,7 +101,7 @@ class RecordedDriver(Opened, Generic[Item]):
         return item
 
     def hand_over(self, made: Reading, at_ns: int) -> Reading:
-        """Return the reading `made`, complete at `at_ns`, moved to now."""
+        """Return the reading `made`, which was complete at `at_ns`, as if `at_ns` were now."""
         self.handed_over_ns = self._clock()
         t_ns = self.handed_over_ns - (at_ns - made.t_ns)
         return msgspec.structs.replace(made, t_ns=t_ns, recorded_ns=made.t_ns)
@@ -140,7 +140,7 @@ class ReadingsDriver(RecordedDriver[Item]):
         self._last_ns: int | None = None
 
     def follow(self, t_ns: int) -> None:
-        """Take in the time at which a reading was made, ns."""
+        """Update `period_ns` by the time at which a reading was made, ns."""
         if self._last_ns is not None and t_ns > self._last_ns:
             step_ns = round((t_ns - self._last_ns) / (self.speed or 1.0))
             self.period_ns = min(step_ns, self.period_ns or step_ns)

@@ -18,7 +18,7 @@ BIOTAC = "int16 pac0\nint16 pac1\nint16 pdc\n\nint16 tac\nint16 tdc\n\nint16[] e
 """Definition of sr_robot_msgs/msg/Biotac.msg in sr_common."""
 BIOTAC_ALL = "Header header\nBiotac[5] tactiles\n"
 WITH_ARRAY = BIOTAC.replace("int16 pdc", "int16[] pac\nint16 pdc")
-"""Another version of that message."""
+"""Another version of that message, with an array of PAC values."""
 ABSENT: NDArray[np.int16] = np.zeros(24, dtype=np.int16)
 ORDER = ("ff", "mf", "rf", "lf", "th")
 
@@ -27,7 +27,7 @@ class Sweep(NamedTuple):
     """One message of `/rh/tactile`."""
 
     t_ns: int
-    """Stamp of the header; the bag takes it 0.7 ms later."""
+    """Stamp of the header, ns; the bag's own time is 0.7 ms later."""
     electrodes: dict[str, NDArray[np.int16]]
     angles: Mapping[str, float] = MappingProxyType({})
     """Angles of a message of `/joint_states` 1 ms earlier."""
@@ -88,7 +88,7 @@ class BagOf:
         packing: rosbag1.Writer.CompressionFormat | rosbag2.CompressionMode | None = None,
         **options: Any,  # noqa: ANN401
     ) -> Path:
-        """Write a bag. `options`: of the writer of ROS 2."""
+        """Write a bag and return `path`. `options`: of the writer of ROS 2."""
         if self.version == 1:
             writer: Any = rosbag1.Writer(path)
         else:

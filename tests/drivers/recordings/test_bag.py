@@ -37,7 +37,7 @@ def demo() -> pd.DataFrame:
 
 
 def sweeps_of(stream: pd.DataFrame, **joints: str) -> list[Sweep]:
-    """`joints`: prefix of the joints' names."""
+    """Rows of a stream as messages. `joints`: `prefix` of the joints' names, `rh_` if not given."""
     prefix = joints.get("prefix", "rh_")
     return [
         Sweep(
@@ -85,7 +85,7 @@ def as_stream(tmp_path_factory: pytest.TempPathFactory) -> Sequence[Verdict]:
         (2, "hand", {"storage_plugin": StoragePlugin.SQLITE3, "version": 8}, {}),
     ],
 )
-def test_a_bag_is_judged_as_its_stream(
+def test_a_bag_is_judged_as_the_same_data_in_csv(
     tmp_path: Path,
     as_stream: Sequence[Verdict],
     version: int,
@@ -106,7 +106,7 @@ def test_a_bag_is_judged_as_its_stream(
 
 
 @pytest.mark.parametrize("plugin", StoragePlugin)
-def test_one_file_of_a_bag_is_read(tmp_path: Path, plugin: StoragePlugin) -> None:
+def test_a_ros_2_bags_storage_file_is_read_alone(tmp_path: Path, plugin: StoragePlugin) -> None:
     folder = BagOf(2).write(tmp_path / "hand", noise(30), storage_plugin=plugin)
     (storage,) = (path for path in folder.iterdir() if path.name != "metadata.yaml")
     assert [reading.seq for reading in readings_of(storage)] == list(range(30))
@@ -133,7 +133,7 @@ def test_a_sensor_that_starts_late_is_read(tmp_path: Path) -> None:
         (2, {"storage_plugin": StoragePlugin.MCAP}, CompressionMode.STORAGE),
     ],
 )
-def test_what_a_packed_bag_unpacks_to_is_bounded(
+def test_a_packed_bag_that_unpacks_to_too_much_is_refused(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     version: int,
@@ -158,7 +158,7 @@ def test_what_a_packed_bag_unpacks_to_is_bounded(
         (lambda sweeps: sweeps[:40] + sweeps[30:], 70, 10),
     ],
 )
-def test_a_repeat_is_dropped_and_counted(
+def test_a_repeated_message_is_dropped_and_counted(
     tmp_path: Path, change: Callable[[list[Sweep]], list[Sweep]], left: int, repeats: int
 ) -> None:
     path = BagOf(1).write(tmp_path / "hand.bag", change(noise(70)))
@@ -170,7 +170,7 @@ def test_a_repeat_is_dropped_and_counted(
 
 
 @pytest.mark.parametrize(("back_ns", "left"), [(900_000_000, 20), (1_000_000_000, 40)])
-def test_a_clock_set_back_by_a_second_repeats_nothing(
+def test_messages_after_a_clock_set_back_a_second_are_kept(
     tmp_path: Path, back_ns: int, left: int
 ) -> None:
     first, sweeps = BagOf(1).write(tmp_path / "1.bag", noise(20)), noise(20, seed=2)
@@ -181,7 +181,7 @@ def test_a_clock_set_back_by_a_second_repeats_nothing(
     assert driver.counters.readings == left
 
 
-def test_stamps_that_stand_still_are_named(
+def test_a_bag_whose_stamps_stand_still_logs_a_warning(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = BagOf(1).write(tmp_path / "hand.bag", [each._replace(t_ns=10**18) for each in noise(30)])
@@ -190,7 +190,7 @@ def test_stamps_that_stand_still_are_named(
 
 
 def held(sweeps: list[Sweep], *, same_stamp: bool) -> list[Sweep]:
-    """Each fourth and seventh of seven is the one before."""
+    """Sweeps of which the fourth and seventh of each seven repeat the one before."""
     found: list[Sweep] = []
     for number, sweep in enumerate(sweeps):
         if number % 7 in (3, 6):
@@ -199,7 +199,7 @@ def held(sweeps: list[Sweep], *, same_stamp: bool) -> list[Sweep]:
     return found
 
 
-def test_a_hand_frozen_in_the_topic_is_not_judged(tmp_path: Path) -> None:
+def test_a_bag_whose_values_freeze_gets_only_unknown_verdicts(tmp_path: Path) -> None:
     sweeps = sweeps_of(demo())
     stuck = [sweeps[110]._replace(t_ns=sweep.t_ns) for sweep in sweeps[110:]]
     path = BagOf(1).write(tmp_path / "hand.bag", [*sweeps[:110], *stuck])
@@ -207,7 +207,7 @@ def test_a_hand_frozen_in_the_topic_is_not_judged(tmp_path: Path) -> None:
         assert {verdict.verdict for verdict in judge(path)} == {"unknown"}
 
 
-def test_absent_sensors_and_values_that_are_not_counts_are_broken(tmp_path: Path) -> None:
+def test_values_not_counts_are_flagged_and_absent_sensors_refused(tmp_path: Path) -> None:
     sweeps = noise(30)
     sweeps[25].electrodes["ff"][:5] = -1, 4096, 5000, 0, 4095  # a count has 12 bits
     path = BagOf(1).write(tmp_path / "hand.bag", sweeps)
@@ -218,7 +218,9 @@ def test_absent_sensors_and_values_that_are_not_counts_are_broken(tmp_path: Path
         readings_of(path, ("ff", "rf"))
 
 
-def test_a_packed_bag_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_gzipped_bag_is_refused_with_advice_to_unpack(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = BagOf(1).write(tmp_path / "hand.bag", noise(5))
     path.write_bytes(gzip.compress(path.read_bytes()))
     assert main(["replay", str(path)]) == 2
@@ -227,7 +229,7 @@ def test_a_packed_bag_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str
         read_grasps(path)
 
 
-def test_a_former_biotac_is_named(tmp_path: Path) -> None:
+def test_a_bag_of_a_biotac_with_19_electrodes_is_refused(tmp_path: Path) -> None:
     sweeps = noise(30)
     for sweep in sweeps:
         sweep.electrodes["th"] = ABSENT[:19]
@@ -236,7 +238,7 @@ def test_a_former_biotac_is_named(tmp_path: Path) -> None:
         fingers_of(path)
 
 
-def test_options_of_tables_are_never_ignored(
+def test_options_of_tables_are_refused_for_a_bag(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = BagOf(1).write(tmp_path / "hand.bag", noise(5))
@@ -260,7 +262,7 @@ def test_options_of_tables_are_never_ignored(
         ("Header header\nBiotac[5] tactiles", "int16 electrodes", "without whole numbers"),
     ],
 )
-def test_another_definition_of_the_message_is_named(
+def test_unusual_message_definitions_are_refused_with_the_reason(
     tmp_path: Path, all_fields: str, fields: str, said: str
 ) -> None:
     store = get_typestore(Stores.ROS1_NOETIC)
@@ -283,7 +285,7 @@ def test_the_joints_of_the_other_hand_are_left_out(tmp_path: Path) -> None:
     assert (read_recording(left)["FFJ3"] == demo()["FFJ3"][:30]).all()
 
 
-def test_a_joint_of_both_hands_has_no_angle(tmp_path: Path) -> None:
+def test_a_joint_reported_for_both_hands_has_no_angle(tmp_path: Path) -> None:
     angles = {"rh_FFJ3": 0.5, "lh_FFJ3": 0.6, "rh_THJ5": 0.7}
     sweeps = [sweep._replace(angles=angles) for sweep in noise(3)]
     path = BagOf(1).write(tmp_path / "hand.bag", sweeps, topic="/tactile")
@@ -320,7 +322,7 @@ def test_joints_are_read_from_the_topic_of_that_name(tmp_path: Path) -> None:
     assert read_recording(path)["FFJ3"].tolist() == [0.5]
 
 
-def test_bags_of_two_hands_are_not_one_run(tmp_path: Path) -> None:
+def test_bags_of_different_hands_are_refused_as_one_run(tmp_path: Path) -> None:
     bags = [
         BagOf(1).write(tmp_path / f"{hand}.bag", noise(5), topic=f"/{hand}/tactile")
         for hand in ("rh", "lh")
@@ -332,7 +334,7 @@ def test_bags_of_two_hands_are_not_one_run(tmp_path: Path) -> None:
             driver.read_ready()
 
 
-def test_a_bag_without_topic_or_with_gate_every_is_refused(
+def test_a_bag_needs_a_tactile_topic_and_refuses_gate_every(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bag = BagOf(1)
@@ -346,7 +348,7 @@ def test_a_bag_without_topic_or_with_gate_every_is_refused(
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_no_damage_of_a_bag_raises_anything_else(tmp_path: Path, seed: int) -> None:
+def test_a_damaged_bag_raises_only_driver_errors(tmp_path: Path, seed: int) -> None:
     chance = random.Random(seed)
     path = BagOf(1).write(tmp_path / "hand.bag", noise(20))
     data = bytearray(path.read_bytes())

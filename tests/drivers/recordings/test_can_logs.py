@@ -51,7 +51,7 @@ def played(paths: Sequence[Path], channel: str = "can0") -> tuple[list[TactileRe
 
 
 @pytest.mark.parametrize("ending", ["asc", "blf", "csv", "trc", "log"])
-def test_what_python_can_writes_plays_as_it_was(
+def test_logs_written_by_python_can_give_the_sent_sweeps(
     tmp_path: Path, ending: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / f"bus.{ending}"
@@ -72,7 +72,7 @@ def test_what_python_can_writes_plays_as_it_was(
 
 
 @pytest.mark.parametrize("ending", ["asc", "blf", "trc"])
-def test_other_frames_of_a_log_are_never_samples(tmp_path: Path, ending: str) -> None:
+def test_error_remote_and_fd_frames_are_never_read_as_samples(tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"bus.{ending}"
     writer = can.Logger(path)
     kinds = ({"is_error_frame": True}, {"is_remote_frame": True}, {"is_fd": True})
@@ -116,7 +116,7 @@ def test_a_damaged_blf_file_plays_up_to_the_damage(
 def test_the_channel_of_a_scene_chooses_the_bus(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Two boards with one id would give one hand."""
+    """Two boards with one id, played together, would look like one hand."""
     caplog.set_level(logging.INFO)
     path = tmp_path / "any.log"
     other = lines_of(4, "can1")
@@ -158,7 +158,7 @@ def test_lines_that_are_not_understood_are_counted(
         ("(1.0) can0 5A1##00D3A1F\n", "has frames of CAN FD alone"),
     ],
 )
-def test_a_log_without_frames_of_a_board_is_refused(tmp_path: Path, text: str, says: str) -> None:
+def test_a_log_without_classic_can_frames_is_refused(tmp_path: Path, text: str, says: str) -> None:
     path = tmp_path / "bus.log"
     path.write_text(text)
     with pytest.raises(RecordingError, match=says):
@@ -166,7 +166,7 @@ def test_a_log_without_frames_of_a_board_is_refused(tmp_path: Path, text: str, s
 
 
 @pytest.mark.parametrize("encoding", ["utf-16", "utf-8-sig"])
-def test_a_log_of_another_encoding_with_a_torn_end_reads(tmp_path: Path, encoding: str) -> None:
+def test_a_log_in_unicode_encoding_ending_in_zeros_is_read(tmp_path: Path, encoding: str) -> None:
     """PowerShell writes UTF-16; a computer that lost power leaves zeros."""
     path = tmp_path / "bus.txt"
     path.write_text("".join(lines_of(3)) + "\0" * 100, encoding)
@@ -174,7 +174,7 @@ def test_a_log_of_another_encoding_with_a_torn_end_reads(tmp_path: Path, encodin
     assert len(readings) == 3
 
 
-def test_a_log_of_endless_ids_fills_no_memory(
+def test_ids_beyond_the_limit_are_not_counted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("graspd.drivers.recordings.can_log.IDS_MAX", 3)
@@ -184,7 +184,9 @@ def test_a_log_of_endless_ids_fills_no_memory(
     assert frames == {("can0", number): 2 for number in range(3)}
 
 
-def test_an_id_that_no_frame_has_is_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_board_id_that_no_frame_has_logs_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     path = tmp_path / "bus.log"
     path.write_text("".join(lines_of(2)).replace(" 5A1#", " 0A2#"))
     readings, _ = played([path])
@@ -200,7 +202,7 @@ def shown(times_ns: Sequence[int]) -> str:
 
 
 def asc(times_ns: Sequence[int]) -> str:
-    """The same of an ASC file, with two lines that are not frames of the bus."""
+    """The same sweeps as an ASC file, with two lines that are not frames of the bus."""
     frames = [f"1 5A1 Rx d 7 {data.hex(' ').upper()}" for data in SAMPLES * (len(times_ns) // 24)]
     lines = [f"{t_ns / 1e9:.6f} {frame}" for t_ns, frame in zip(times_ns, frames, strict=True)]
     head = ["base hex  timestamps relative", "0.000000 Start of measurement", "0.000000 1 what?"]
@@ -222,7 +224,7 @@ def test_times_since_the_last_frame_are_recognised(
     assert [reading.made_ns for reading in readings] == times_ns[23::24]
 
 
-def test_a_clock_that_was_set_back_is_a_pause(tmp_path: Path) -> None:
+def test_a_log_clock_set_back_plays_as_a_pause(tmp_path: Path) -> None:
     """Two logs in one file look like this; no sweep has frames of both."""
     path = tmp_path / "bus.log"
     since_ns = 10**18 + 66 * STEP_NS - 1_100_000_000

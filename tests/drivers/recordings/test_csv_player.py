@@ -73,7 +73,7 @@ def test_a_streams_period_is_its_shortest_step(tmp_path: Path) -> None:
     assert periods_ms == [None, 0, 10, 5, 5]
 
 
-def test_a_lag_skips_nothing(tmp_path: Path) -> None:
+def test_rows_overdue_after_a_lag_are_all_played(tmp_path: Path) -> None:
     clock = Clock()
     with ReplayDriver([write(tmp_path, table(6))], clock=clock) as driver:
         driver.read_ready()
@@ -154,7 +154,7 @@ def test_open_checks_the_header_of_every_file(tmp_path: Path) -> None:
         ReplayDriver([good, write(tmp_path, table(0), "empty.csv")]).open()
 
 
-def test_unknown_columns_are_listed_and_logged_once(
+def test_unknown_columns_of_all_files_are_logged_once(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     extra = [*TABLE_HEADER, "force", *(f"x{k}" for k in range(20))]

@@ -51,7 +51,7 @@ def test_a_table_gives_its_counts_and_annotations() -> None:
         assert row.annotation.slipped == bool(index % 2)
 
 
-def test_columns_stand_in_any_order() -> None:
+def test_columns_may_stand_in_any_order() -> None:
     columns = [*reversed(ELECTRODES), "slipped"]
     (row,) = rows_of(table(1, columns=columns), ("th", "ff"))
     expected = [[count(0, 48 + k) for k in range(24)], [count(0, k) for k in range(24)]]
@@ -59,7 +59,7 @@ def test_columns_stand_in_any_order() -> None:
     assert row.annotation.object_name is None
 
 
-def test_only_unknown_columns_are_listed() -> None:
+def test_only_unknown_columns_are_listed_as_ignored() -> None:
     header = [*TABLE_HEADER, "force", "", "s", "force", "FFJ3"]
     content = ",".join(header).encode() + b"\n" + b"0," * 78 + b"0\n"
     found = survey(PATH, io.BytesIO(content), ("mf",))
@@ -131,7 +131,7 @@ def test_a_wrong_recording_is_refused_with_line_and_column(content: bytes, messa
 
 
 @pytest.mark.parametrize("label", ["2", "\u0661"])
-def test_an_outcome_that_cannot_be_read_matters_where_needed(label: str) -> None:
+def test_an_unreadable_outcome_is_unknown_or_if_needed_refused(label: str) -> None:
     content = table(2, {1: {"slipped": label}})
     assert rows_of(content)[1].annotation.slipped is None
     told = rf"line 3, column slipped: {re.escape(repr(label))} is not an outcome"
@@ -140,7 +140,7 @@ def test_an_outcome_that_cannot_be_read_matters_where_needed(label: str) -> None
 
 
 @pytest.mark.parametrize("t", ["nan", "", "1e999", "1_0"])
-def test_a_time_is_a_number_or_a_clock(t: str) -> None:
+def test_a_cell_that_is_not_a_time_is_refused(t: str) -> None:
     with pytest.raises(RecordingError, match=r"line 2, column t: .* is not a time"):
         rows_of(stream([t, "1"]))
 
@@ -154,7 +154,7 @@ def test_a_time_is_a_number_or_a_clock(t: str) -> None:
         ("2 days 01:02:03", 176_523.0),
     ],
 )
-def test_a_clock_is_read_in_seconds(cell: str, t_s: float) -> None:
+def test_dates_times_of_day_and_spans_are_read_in_seconds(cell: str, t_s: float) -> None:
     assert time_of(cell) == t_s
 
 
@@ -165,7 +165,7 @@ def test_a_line_of_exactly_the_limit_is_read() -> None:
         rows_of(table(1, {0: {"object": "x" * (room + 1)}}))
 
 
-def test_a_last_row_without_line_end_is_cut_off() -> None:
+def test_a_last_row_without_line_end_is_flagged_cut_off() -> None:
     *whole, last = rows_of(table(3).rstrip(b"\n"))
     assert all(not row.faults.any() for row in whole)
     assert (last.faults == ElectrodeFault.CUT_OFF).all()
@@ -237,7 +237,7 @@ def test_a_malformed_count_makes_its_electrode_faulty(cell: str) -> None:
 
 
 @pytest.mark.parametrize(("cell", "expected"), COUNTS.items())
-def test_an_integer_may_be_written_in_several_ways(cell: str, expected: int) -> None:
+def test_a_count_may_be_written_in_several_ways(cell: str, expected: int) -> None:
     (row,) = rows_of(table(1, {0: {"th_biotac_24": cell}}), strict=True)
     assert row.counts[2, 23] == expected
     assert not row.faults.any()
@@ -245,7 +245,7 @@ def test_an_integer_may_be_written_in_several_ways(cell: str, expected: int) -> 
 
 @given(st.text(max_size=12) | st.from_regex(r"[0-9.eE+_ -]{1,8}", fullmatch=True))
 @example("1_0")
-def test_a_count_is_read_as_python_reads_it(cell: str) -> None:
+def test_an_accepted_count_is_what_python_float_reads(cell: str) -> None:
     value = count_of(cell)
     if value is not None:
         assert set(cell.strip()) <= set("0123456789.eE+-")
@@ -290,13 +290,13 @@ def scaled(change: Callable[[int], str], separator: str = ",") -> bytes:
         (scaled(lambda _: "high"), "text in place of numbers?"),
     ],
 )
-def test_values_that_are_not_counts_are_refused_once(content: bytes, said: str) -> None:
+def test_values_that_are_not_counts_are_refused_with_a_guess(content: bytes, said: str) -> None:
     message = refusal(content)
     assert "of 288 values are not counts, whole numbers in 0..4095, the first is '" in message
     assert said in message
 
 
-def test_joints_in_degrees_are_named() -> None:
+def test_joints_in_degrees_are_refused() -> None:
     degrees = {"FFJ1": ["1", "2", "3", "1"], "rh_FFJ3": ["45.8", "46.1", "46.0", "3"]}
     content = stream(TIMES, degrees)
     assert "FFJ3 = 45.8 rad is beyond every joint: degrees?" in refusal(content)
@@ -304,7 +304,7 @@ def test_joints_in_degrees_are_named() -> None:
     assert "FFJ1 [deg]: angles are in degrees: write radians" in refusal(named)
 
 
-def test_a_single_large_angle_is_bad() -> None:
+def test_a_single_angle_beyond_reach_becomes_nan() -> None:
     angles = ["0.5", "70", *["0.5"] * 18]
     rows = rows_of(stream([f"{n / 100}" for n in range(20)], {"FFJ3": angles}))
     assert [math.isnan(row.position_rad[0]) for row in rows] == [False, True, *[False] * 18]

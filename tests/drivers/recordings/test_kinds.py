@@ -1,4 +1,4 @@
-"""What a file is, by its content; what is packed or piped is read as the file would be."""
+"""Kinds of files, by their content; packed and piped files are read as plain ones are."""
 
 from __future__ import annotations
 
@@ -89,13 +89,13 @@ def made(path: Path, content: bytes | Callable[[Path], None]) -> Path:
 
 
 @pytest.mark.parametrize(("content", "kind"), FILES.values(), ids=FILES)
-def test_a_file_is_what_it_holds_whatever_its_name(
+def test_the_kind_of_a_file_depends_on_its_content_alone(
     tmp_path: Path, content: bytes | Callable[[Path], None], kind: Kind
 ) -> None:
     assert kind_of(made(tmp_path / "RUN.XYZ", content)) is kind
 
 
-def test_a_packed_file_is_what_it_holds(tmp_path: Path) -> None:
+def test_a_packed_file_has_the_kind_of_its_content(tmp_path: Path) -> None:
     assert kind_of(write(tmp_path, gzip.compress(b"LOGG\x90\0\0\0"))) is Kind.BLF
     (tmp_path / "metadata.yaml").touch()
     assert kind_of(tmp_path) is Kind.ROS2_BAG
@@ -113,7 +113,7 @@ OTHERS: dict[str, tuple[bytes | Callable[[Path], None], str]] = {
 
 
 @pytest.mark.parametrize(("content", "said"), OTHERS.values(), ids=OTHERS)
-def test_any_other_file_is_named_with_the_page(
+def test_other_files_are_refused_with_a_reason_and_the_page(
     tmp_path: Path, content: bytes | Callable[[Path], None], said: str
 ) -> None:
     path = made(tmp_path / "grasps.csv", content)
@@ -174,7 +174,9 @@ def test_standard_input_is_read_as_a_file(tmp_path: Path, monkeypatch: pytest.Mo
         assert paths == [copy]
 
 
-def test_a_pipe_is_read_once_and_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_pipe_is_copied_up_to_a_size_limit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pipe = tmp_path / "pipe"
 
     def played(content: bytes) -> Path:

@@ -28,7 +28,7 @@ PLAIN = table(4)
 
 
 def values(rows: Sequence[Row]) -> list[object]:
-    """Everything that rows say, without the lines where they stand."""
+    """Counts, object and outcome of each row, and True if a count is faulty."""
     return [
         (row.counts.tolist(), row.faults.any(), row.annotation.object_name, row.annotation.slipped)
         for row in rows
@@ -82,7 +82,7 @@ def test_a_name_in_quotes_may_have_line_breaks() -> None:
     assert rows_of(content)[2].annotation.line == 5
 
 
-def test_a_row_that_looks_like_a_comment_is_not_lost() -> None:
+def test_a_row_beginning_with_a_hash_is_refused_unless_quoted() -> None:
     content = PLAIN.replace(b"thing_2", b"#2 mug")
     assert "line 4: the line begins with #, as a comment does" in refusal(content)
     quoted = PLAIN.replace(b"thing_2", b'"#2 mug"')
@@ -90,7 +90,7 @@ def test_a_row_that_looks_like_a_comment_is_not_lost() -> None:
     assert values(rows_of(PLAIN + b"# " + PLAIN.split(b"\n")[0] + b"\n")) == values(rows_of(PLAIN))
 
 
-def test_a_row_of_many_lines_is_bounded() -> None:
+def test_a_row_of_many_lines_beyond_the_limit_is_refused() -> None:
     content = PLAIN + b'"a' + b'\n","a' * 40_000
     assert "longer than 65536 characters" in refusal(content)
 
@@ -135,11 +135,11 @@ SCHEMES: dict[str, Callable[[str, int], str]] = {
 
 
 @pytest.mark.parametrize("name", SCHEMES.values(), ids=SCHEMES)
-def test_electrodes_are_known_by_each_scheme(name: Callable[[str, int], str]) -> None:
+def test_electrodes_are_recognised_by_each_naming_scheme(name: Callable[[str, int], str]) -> None:
     assert values(rows_of(renamed(name))) == values(rows_of(PLAIN))
 
 
-def test_one_finger_needs_no_name() -> None:
+def test_electrode_names_need_no_finger_if_one_is_read() -> None:
     content = renamed(lambda _, number: f"E{number}", ["mf"])
     content = content.replace(b"ff_biotac", b"x").replace(b"th_biotac", b"y")
     assert [row.counts.tolist() for row in rows_of(content, ["th"])] == [
@@ -150,7 +150,7 @@ def test_one_finger_needs_no_name() -> None:
 
 @pytest.mark.parametrize("name", ["finger", "Sensor_ID", "fingertip"])
 @pytest.mark.parametrize("block", [1, 512])
-def test_rows_of_a_finger_each_are_not_of_one_finger(name: str, block: int) -> None:
+def test_a_file_with_one_finger_per_row_is_refused(name: str, block: int) -> None:
     generator = np.random.default_rng(1)
     header = ",".join([name, *(f"E{number}" for number in range(1, 25))])
     rows = [
@@ -182,7 +182,7 @@ def test_rows_of_a_finger_each_are_not_of_one_finger(name: str, block: int) -> N
         ("ff_e", "frame_id", ["1", "2", "3", "4"]),
     ],
 )
-def test_a_column_that_names_no_second_finger_is_left_out(
+def test_a_finger_column_without_a_second_finger_is_ignored(
     header: str, name: str, words: Sequence[str]
 ) -> None:
     plain = renamed(lambda f, n: f"{header}{n}" if f == "ff" else f"{f}x{n}").decode().splitlines()
@@ -239,7 +239,7 @@ TIMES = ["100.00", "100.01", "100.02", "100.03"]
 
 
 def timed(name: str, cells: Sequence[str], separator: str = ",") -> bytes:
-    """A stream whose column of times is called `name`; several columns by commas."""
+    """A stream whose column of times is called `name`; several names have commas between."""
     return stream(cells).replace(b"t,", name.encode() + b",", 1).replace(b",", separator.encode())
 
 

@@ -101,7 +101,7 @@ def test_a_line_that_is_not_a_frame_gives_none(line: str) -> None:
     assert parse(line) is None
 
 
-def test_where_candump_lost_frames_is_a_loss() -> None:
+def test_a_dropcount_line_of_candump_is_a_loss_frame() -> None:
     line = "DROPCOUNT: dropped 3 CAN frames on 'can0,5A1:7FF' socket (total drops 3)\n"
     assert parse(line) == Logged(None, "can0", CanFrame(0, b"", LOST))
 
@@ -145,7 +145,7 @@ def test_decimal_data_of_an_asc_file_is_read() -> None:
     assert found == Logged(HALF_NS, "can0", THREE)
 
 
-def test_other_lines_of_an_asc_file_take_time() -> None:
+def test_asc_lines_without_frames_keep_their_relative_time() -> None:
     lines = ["base hex  timestamps relative", "0.5 1  Statistic: D 1 R 0"]
     ((number, _, found),) = read_asc(lines)
     assert (number, found) == (2, Logged(HALF_NS, NO_BUS, None, may_be_step=True))
@@ -153,7 +153,7 @@ def test_other_lines_of_an_asc_file_take_time() -> None:
 
 TRC_2_1 = [";$FILEVERSION=2.1", ";$STARTTIME=0", ";$COLUMNS=N,O,T,B,I,d,R,L,D"]
 DAYS_S = 25569 * 86400
-"""From the zero of TRC files, 30 December 1899, to that of Unix."""
+"""Seconds from the zero of times in TRC files, 30 December 1899, to that of Unix."""
 
 
 @pytest.mark.parametrize(
@@ -219,7 +219,7 @@ def test_long_bytes_come_back_in_pieces(data: bytes) -> None:
     assert {(t_ns, event) for t_ns, (event, _) in found} == {(5, LineEvent.RECEIVED)}
 
 
-def test_damaged_records_are_counted_and_the_first_is_placed(
+def test_damaged_records_are_counted_and_the_first_is_located(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / "line.serial"
@@ -241,7 +241,7 @@ def test_a_file_without_anything_from_a_link_is_refused(tmp_path: Path, content:
         SerialLog([path], ("ff", "mf", "th")).open()
 
 
-def test_a_reading_is_handed_over_as_old_as_it_was() -> None:
+def test_hand_over_keeps_the_age_of_a_recorded_reading() -> None:
     clock = Clock()
     player = ReplayDriver([Path("x.csv")], clock=clock)
     clock.now_ns += 5 * MS

@@ -48,7 +48,7 @@ def test_the_unit_of_times_is_known_by_their_steps(tmp_path: Path, unit_s: float
     ("time", "apart_s"),
     [(lambda n: f"{60 * n + 60}", "0.06"), (lambda n: f"{n // 6:02}:{n % 6}0:00", "600")],
 )
-def test_grasps_with_times_minutes_apart_are_doubted(
+def test_grasps_with_times_minutes_apart_are_refused_without_read_as(
     tmp_path: Path, time: Callable[[int], str], apart_s: str
 ) -> None:
     header, *lines = DEMO_TABLE.read_text().splitlines()[:100]
@@ -60,7 +60,7 @@ def test_grasps_with_times_minutes_apart_are_doubted(
     assert layout_of(path, FINGERS, "stream").is_stream
 
 
-def test_a_rate_is_never_ignored(tmp_path: Path) -> None:
+def test_a_rate_replaces_times_only_when_read_as_stream(tmp_path: Path) -> None:
     path = write(tmp_path, stream(["100.00", "100.01", "100.02", "100.03"]))
     layout = layout_of(path, FINGERS, "stream", 50.0)
     assert [row.t_s for row in read_rows(path, FINGERS, layout=layout)] == [0.0, 0.02, 0.04, 0.06]
@@ -75,7 +75,7 @@ def test_a_rate_is_never_ignored(tmp_path: Path) -> None:
         (["0.5"], "most rows have the time of the row before"),
     ],
 )
-def test_times_that_no_stream_has_may_be_of_grasps(
+def test_times_that_fall_or_stand_are_refused_without_read_as(
     tmp_path: Path, times: Sequence[str], said: str
 ) -> None:
     header, *lines = DEMO_TABLE.read_text().splitlines()
@@ -88,7 +88,9 @@ def test_times_that_no_stream_has_may_be_of_grasps(
 
 
 @pytest.mark.parametrize(("every", "mixed"), [(1, False), (10, True), (25, True)])
-def test_sweeps_without_times_are_never_a_table(tmp_path: Path, every: int, mixed: bool) -> None:
+def test_sweeps_without_times_are_refused_unless_read_as_stream(
+    tmp_path: Path, every: int, mixed: bool
+) -> None:
     names, cells = sweeps(2000)
     cells = cells[::every]
     if mixed:
@@ -131,7 +133,7 @@ def test_sweeps_with_broken_electrodes_are_never_a_table(
         layout(content, tmp_path, "table")
 
 
-def test_several_readings_of_each_grasp_are_a_table_if_told(tmp_path: Path) -> None:
+def test_repeated_readings_of_grasps_need_read_as_table(tmp_path: Path) -> None:
     header, *lines = DEMO_TABLE.read_text().splitlines()
     cells = np.array([line.split(",") for line in lines[:40]]).repeat(6, axis=0)
     noise = np.random.default_rng(2).normal(0.0, 5.0, (240, 72))
@@ -142,7 +144,7 @@ def test_several_readings_of_each_grasp_are_a_table_if_told(tmp_path: Path) -> N
     assert not layout(content, tmp_path, "table")
 
 
-def test_few_repeated_grasps_are_a_table_if_labelled_or_told(tmp_path: Path) -> None:
+def test_few_repeated_grasps_need_labels_or_read_as_table(tmp_path: Path) -> None:
     header, *lines = DEMO_TABLE.read_text().splitlines()
     labelled = "\n".join([header, *lines[:100], *lines[:8], ""])
     unknown = labelled.replace("slipped", "x", 1).encode()
@@ -160,7 +162,7 @@ def test_few_repeated_grasps_are_a_table_if_labelled_or_told(tmp_path: Path) -> 
         (1250, 12, "most of 12 rows are much like another"),
     ],
 )
-def test_few_slow_sweeps_are_never_a_table(
+def test_few_slow_sweeps_without_times_are_refused(
     tmp_path: Path, first: int, rows: int, said: str
 ) -> None:
     names, cells = sweeps(first + 25 * rows)
