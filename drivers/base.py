@@ -76,7 +76,7 @@ class TactileReading(msgspec.Struct, frozen=True, eq=False, gc=False):
     """One sweep over all electrodes of all fingers of a hand."""
 
     t_ns: int
-    """Monotonic time, ns, of the end of the sweep; of its last byte's arrival without a clock."""
+    """Monotonic time, ns, of the end of the sweep, or of its last byte's arrival if unknown."""
     seq: int
     """Number of the reading; one more per reading that the sensor made. A gap is a loss."""
     counts: NDArray[np.uint16]
@@ -300,7 +300,7 @@ class LinkError(DriverError):
 
     @classmethod
     def from_errno(cls, error: BaseException, text: str, endpoint: str | None = None) -> LinkError:
-        """Return an error of the cause that the `errno` of `error` or its causes shows, if any."""
+        """Return an error whose cause follows from `errno` of `error` or its causes, or is unknown."""
         reason: BaseException | None = error
         while reason is not None:
             cause = _CAUSES.get(getattr(reason, "errno", None))

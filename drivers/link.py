@@ -28,7 +28,7 @@ WARNINGS_MAX = 8
 CLOCK_STEP_NS: Final = 1_000_000_000
 """Apparent delay of a message, ns, from which on a fall of its sender's time is a new zero."""
 LEAP: Final = 10
-"""Speed of a sender's time, in that of our clock, from which on it was set or is not in seconds."""
+"""Speed of a sender's time, as a multiple of ours, above which it was set or is not in seconds."""
 LEAP_NS: Final = 200_000_000
 """Rise of a sender's time that is always allowed, ns, because a delayed message followed by
 losses has such a rise."""

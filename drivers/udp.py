@@ -140,7 +140,7 @@ class DatagramCounters(DriverCounters):
     """Counters of the link; a driver's own counters contain them."""
 
     foreign_datagrams: int = 0
-    """Datagrams from another sender than the current one; dropped."""
+    """Datagrams from another sender than the current or allowed one; dropped."""
     kernel_drops: int = 0
     """Datagrams that the kernel dropped because they were not read in time."""
     link_losses: int = 0

@@ -288,7 +288,7 @@ def _nearest(names: Sequence[str]) -> str:
 
 
 def time_column(names: Sequence[str]) -> TimeColumn | None:
-    """Return the column of times: `t`, else the first of a usual name or unit; None: none."""
+    """Return the column of times: `t`, else the first of a usual name or unit; None without any."""
     found = [(place, match) for place, name in enumerate(names) if (match := _is_time(name))]
     found = found or [
         (place, match) for place, name in enumerate(names) if (match := _IN_UNIT.fullmatch(name))

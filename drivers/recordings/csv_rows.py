@@ -118,7 +118,10 @@ class Recording:
         return np.array(counts, dtype=np.uint16).reshape(self._shape), faults
 
     def _unusual(self, text: str, place: int, faults: NDArray[np.uint8]) -> int:
-        """Return the count in a cell of unusual text; if none, raise or flag `place`, return 0."""
+        """Return the count in a cell of unusual text; without one, flag `place` and return 0.
+
+        Raises instead if strict.
+        """
         count = count_of(text, decimal_comma=self._comma)
         if count is not None:
             return count

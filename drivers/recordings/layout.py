@@ -49,10 +49,10 @@ ALIKE_SHARE_MAX: Final = 0.85
 `NEAR_COUNTS` count twice. In noisy streams up to 100 % are within the former, none in the latter.
 """
 DOUBTED_SHARES: Final = 0.1, 0.6
-"""These two limits for rows with neither outcomes of both kinds nor `read_as`.
+"""`NEAR_SHARE_MAX` and `ALIKE_SHARE_MAX` for rows with neither both outcomes nor `read_as`.
 
-In pieces of 12 sweeps at 4 Hz, 2 % are below these limits, and 22 % below those above. In pieces of
-12 published grasps in a row, 20 % are above these limits, and under 1 % of random ones.
+Among pieces of 12 sweeps at 4 Hz, 2 % are below these limits, and 22 % below the usual two. Among
+pieces of 12 published grasps in a row, 20 % are above these, and among random ones under 1 %.
 """
 FEW_ROWS: Final = 10
 """Fewest rows by which a file can be refused as what `read_as` says."""

@@ -104,8 +104,8 @@ def is_outcome(cell: str) -> bool:
 def problem_with(cells: Sequence[str], *, decimal_comma: bool) -> str | None:
     """Return why values of electrodes are not counts; None: they are.
 
-    Up to half may be missing or out of range, as of broken electrodes. Up to a twentieth may have
-    a point or comma, or be negative other than -1, which stands for a missing value.
+    Up to half of those not blank may be wrong, as of broken electrodes. Up to a twentieth of them
+    may have a point or comma, or be negative other than -1, which stands for a missing value.
     """
     given = [cell for cell in cells if cell.strip().lower() not in BLANK]
     wrong = [cell for cell in given if count_of(cell, decimal_comma=decimal_comma) is None]

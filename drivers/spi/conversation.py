@@ -121,7 +121,7 @@ class Conversation:
         self.link.greeting()
 
     def lost(self, cause: LinkCause, why: str, now_ns: int) -> None:
-        """Close the link for `cause`, until the next `opened`."""
+        """Close the link until the next `opened`. `why`: the text of `cause` for people."""
         self._sweeps = None
         self.counters.link_failures += 1
         self.counters.unanswered_pings += len(self._pings)
@@ -237,7 +237,10 @@ class Conversation:
             self.counters.clock_faults += clock.is_doubted
 
     def _is_confirmed(self, serials: tuple[str, ...]) -> bool:
-        """Return True if two HELLOs in a row had these serial numbers."""
+        """Return True if two HELLOs in a row had these serial numbers, or they are confirmed ones.
+
+        An empty number, of a silent sensor, counts as unchanged.
+        """
         before = self._confirmed if len(self._confirmed) == len(serials) else ("",) * len(serials)
         merged = tuple(new or old for new, old in zip(serials, before, strict=True))
         if merged != before and serials != self._unconfirmed:

@@ -344,7 +344,7 @@ def encode(message: Message) -> bytes:
 
 
 def decode(kind: int, payload: bytes) -> Message | None:
-    """Return the message of a frame, or None if the protocol forbids it."""
+    """Return the message of a frame; None for an unknown type, or if the protocol forbids it."""
     message_type = _MESSAGES.get(kind)
     message = None if message_type is None else message_type.from_bytes(payload)
     return message if message is not None and message.is_sound() else None

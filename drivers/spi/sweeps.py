@@ -1,8 +1,8 @@
 """Convert sweeps of a bridge to readings with the time at which they were made. No I/O.
 
 The answer to a PING holds a tick of the bridge's clock. The tick was not before the PING was sent,
-which gives a lower bound of its time; see `DeviceClock`. Arrival times of readings are not used, so
-batches of a USB adapter and stalls of the host do no harm.
+which gives a lower bound of its time; see `DeviceClock`. Arrival times of readings only limit this,
+so batches of a USB adapter and stalls of the host do no harm.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class BridgeCounters(FrameCounters):
     link_failures: int = 0
     """Times that opening or greeting failed, or the link was lost."""
     refused_bridges: int = 0
-    """Greetings of a bridge whose version, layout or number of sensors does not fit."""
+    """Greetings of a bridge whose version, layout, sweep period or number of sensors is refused."""
     restarts: int = 0
     """Resets that the bridge reported while it was sweeping."""
     unanswered_pings: int = 0
@@ -167,7 +167,7 @@ class ClockError(ValueError):
 
 
 class _Bound(NamedTuple):
-    """Bounds by one PING on the host time, ns, at which the bridge's clock showed `tick`."""
+    """Bound by one PING, lower or upper, of the host time at which the clock showed `tick`."""
 
     tick: int
     t_ns: int

@@ -68,7 +68,7 @@ class ScriptedBridge:
             self.sent_bytes += os.write(self._master, data)
 
     def heard(self, last: type[Message]) -> list[Message]:
-        """What the host said, up to a message of the given type."""
+        """Messages from the host, up to one of type `last`."""
         messages: list[Message] = []
         deadline = time.monotonic() + PATIENCE_S
         while not messages or type(messages[-1]) is not last:
@@ -113,7 +113,7 @@ def sweep(seq: int, tick: int, present: int = 7, read: NDArray[np.uint16] | None
 
 
 def said(conversation: Conversation, now_ns: int) -> list[Message]:
-    """What the host says, taken as sent."""
+    """Messages that the host has to send now, recorded as sent."""
     messages = []
     parser = FrameParser(DIGEST)
     for data in conversation.say(now_ns):
@@ -136,13 +136,13 @@ def opened(nonce: int = 41, sensors: Sequence[str] | None = None) -> Conversatio
 
 
 def answer(conversation: Conversation, about: Hello, now_ns: int = T0) -> None:
-    """Let a HELLO answer the PING that is due."""
+    """Let the HELLO `about` answer the PING that is due."""
     (nonce,) = (each.nonce for each in said(conversation, now_ns) if isinstance(each, Ping))
     assert hear(conversation, dataclasses.replace(about, nonce=nonce), now_ns) == []
 
 
 def told(conversation: Conversation, serials: tuple[str, ...], now_ns: int) -> None:
-    """Let a HELLO of these sensors answer; if the link is lost, it is opened again."""
+    """Let a HELLO with these serial numbers answer the due PING; reopen the link if that loses it."""
     about = dataclasses.replace(hello(0, period_ms=50), serials=serials)
     answer(conversation, about, now_ns)
     if conversation.link.state is LinkState.WAITING:
@@ -150,7 +150,7 @@ def told(conversation: Conversation, serials: tuple[str, ...], now_ns: int) -> N
 
 
 def greeted(about: Hello | None = None, sensors: Sequence[str] | None = None) -> Conversation:
-    """A conversation with a bridge that tells this of itself, before its START."""
+    """A conversation with a bridge that has answered with the HELLO `about`, before START."""
     conversation = opened(40, sensors)
     for _ in range(2):  # the serial numbers are believed when they are told again
         if conversation.hello is None and conversation.link.state is LinkState.GREETING:
@@ -181,14 +181,14 @@ class Rig:
     clock: Clock
 
     def greet(self) -> list[Message]:
-        """Bring the driver so far that it has sent START; what it had said until its first PING."""
+        """Open the driver and answer two PINGs, so that it sends START; return its first messages."""
         self.driver.open()
         first = self._answered()
         self._answered()
         return first
 
     def _answered(self) -> list[Message]:
-        """Answer the next PING; what was said until then."""
+        """Answer the next PING; return the driver's messages up to it."""
         heard = self.bridge.heard(Ping)
         (ping,) = (message for message in heard if isinstance(message, Ping))
         self.bridge.send(hello(ping.nonce))

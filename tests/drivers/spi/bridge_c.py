@@ -1,4 +1,4 @@
-"""What the tests of the bridge's firmware share: its programs, its frames, a host to talk to it.
+"""Tools for tests of the bridge's firmware: its programs, and sound and damaged frames.
 
 Frames are computed with `zlib`, `cobs` and `struct` alone, so that they owe nothing to the driver.
 """
@@ -38,7 +38,7 @@ Counts = NDArray[np.uint16]
 
 
 def build_program(folder: Path, name: str, *sources: str) -> Path:
-    """Compile a program of files under `deploy/bridge`, as the house wants its C."""
+    """Compile a program of files under `deploy/bridge`, with sanitizers; warnings are errors."""
     program = folder / name
     files = [str(file) for source in sources for file in sorted(BRIDGE.glob(source))]
     includes = [f"-I{BRIDGE}/src", f"-I{BRIDGE}/host"]
@@ -68,7 +68,7 @@ def frame(kind: int, payload: bytes = b"", digest: int = DIGEST) -> bytes:
 
 
 def unframe(encoded: bytes) -> tuple[int, bytes] | None:
-    """Type and payload of what stood before a zero, or None if it is damaged."""
+    """Type and payload of an encoded frame without its zero, or None if it is damaged."""
     if len(encoded) > ENCODED_MAX:
         return None
     try:
@@ -84,7 +84,7 @@ def unframe(encoded: bytes) -> tuple[int, bytes] | None:
 
 
 def judged(stream: bytes) -> tuple[list[str], int]:
-    """What a receiver must find in a stream: the frames as the probe prints them, and errors."""
+    """The host's frames in a stream, as the probe prints them, and the number of other pieces."""
     found, errors = [], 0
     for encoded in stream.split(b"\0")[:-1]:
         if not encoded:
@@ -98,7 +98,7 @@ def judged(stream: bytes) -> tuple[list[str], int]:
 
 
 def damaged(rng: random.Random) -> bytes:
-    """A frame of a host that something happened to, with its zero."""
+    """A frame of a host, spoilt in one of seven ways, with its zero."""
     kind = rng.choice((PING, START, STOP, rng.randrange(256)))
     size = HOST_PAYLOADS.get(kind, rng.randrange(8))
     whole = bytearray(frame(kind, rng.randbytes(size), rng.choice((DIGEST, DIGEST, 0))))

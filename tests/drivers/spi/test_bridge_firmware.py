@@ -45,7 +45,7 @@ pytestmark = pytest.mark.usefixtures("comes_first")
 
 @pytest.fixture(scope="module")
 def bridge_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where programs are built; skips where nothing can be."""
+    """Folder in which programs are built; skips without a C compiler that has sanitizers."""
     if shutil.which("cc") is None:
         pytest.skip("no C compiler (cc)")
     folder = tmp_path_factory.mktemp("bridge")
@@ -62,7 +62,7 @@ def bridge_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def bridge_probe(bridge_folder: Path) -> Path:
-    """Answers questions about the C implementation."""
+    """Program of the C implementation that answers the questions of `ask`."""
     core = ("src/biotac.c", "src/cobs.c", "src/crc32.c", "src/protocol.c")
     return build_program(bridge_folder, "probe", "test/probe.c", *core)
 
@@ -87,7 +87,7 @@ def test_the_digest_is_that_of_the_documented_schema() -> None:
     assert re.findall(r"PROTOCOL_DIGEST 0x(\w+)u", header) == [f"{DIGEST:08X}"]
 
 
-def test_graspd_knows_the_firmware_that_it_ships() -> None:
+def test_the_drivers_firmware_version_is_that_of_the_shipped_source() -> None:
     header = (BRIDGE / "src" / "bridge.h").read_text()
     (made,) = re.findall(r"BRIDGE_FIRMWARE = 0x(\w+),", header)
     assert int(made, 16) == FIRMWARE
@@ -158,7 +158,7 @@ def test_every_frame_agrees_with_an_independent_computation(bridge_probe: Path) 
     assert max(map(len, expected)) <= 672
 
 
-def test_100000_damaged_frames_are_judged_exactly_and_sound_ones_found(
+def test_sound_frames_are_found_among_100000_damaged_and_errors_counted(
     bridge_probe: Path,
 ) -> None:
     seed = 20251121
@@ -179,7 +179,7 @@ def test_100000_damaged_frames_are_judged_exactly_and_sound_ones_found(
     assert errors > 50_000
 
 
-def test_the_driver_reads_the_firmware_on_a_pc(bridge_folder: Path, tmp_path: Path) -> None:
+def test_the_driver_reads_the_firmware_running_on_a_pc(bridge_folder: Path, tmp_path: Path) -> None:
     program = build_program(bridge_folder, "graspd-bridge", "src/*.c", "host/*.c")
     link = tmp_path / "port"
     readings: list[TactileReading] = []

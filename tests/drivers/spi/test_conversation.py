@@ -1,4 +1,4 @@
-"""What is said with a bridge and when, message by message, by the numbers of its protocol."""
+"""Messages between host and bridge, and when they are sent, by the numbers of the protocol."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def state(conversation: Conversation) -> LinkState:
     return conversation.link.state
 
 
-def test_a_silent_bridge_is_asked_four_times() -> None:
+def test_a_silent_bridge_is_given_up_after_four_pings() -> None:
     conversation, now_ns = opened(), T0
     for number in range(4):
         assert conversation.due_ns == now_ns
@@ -58,7 +58,7 @@ def test_a_silent_bridge_is_asked_four_times() -> None:
     assert conversation.counters.link_failures == 1
 
 
-def test_a_nonce_is_never_that_of_a_reset() -> None:
+def test_nonces_wrap_without_zero_which_means_a_reset() -> None:
     conversation = opened(nonce=(1 << 32) - 2)
     pings = [said(conversation, T0 + tries * 500 * MS)[1] for tries in range(3)]
     assert pings == [Ping((1 << 32) - 1), Ping(1), Ping(2)]
@@ -74,7 +74,9 @@ def test_a_ping_is_sent_every_247_milliseconds() -> None:
 
 
 @pytest.mark.parametrize(("period_ms", "silence_ms"), [(10, 100), (20, 200), (1000, 10_000)])
-def test_silence_is_ten_missing_sweeps_and_100_ms(period_ms: int, silence_ms: int) -> None:
+def test_the_link_is_lost_after_ten_sweep_periods_of_silence(
+    period_ms: int, silence_ms: int
+) -> None:
     conversation = greeted(hello(0, period_ms=period_ms))
     assert said(conversation, T0) == [Start()]
     heard_ns = T0 + 7 * MS
@@ -95,13 +97,15 @@ def test_silence_is_ten_missing_sweeps_and_100_ms(period_ms: int, silence_ms: in
         (10, 2, "port: the bridge has 2 sensors, the scene needs 3"),
     ],
 )
-def test_a_bridge_too_slow_or_too_small_is_refused(period_ms: int, sensors: int, why: str) -> None:
+def test_a_bridge_too_slow_or_with_few_sensors_is_refused(
+    period_ms: int, sensors: int, why: str
+) -> None:
     conversation = greeted(hello(0, period_ms=period_ms, sensors=sensors))
     assert (conversation.link.reason, conversation.counters.refused_bridges) == (why, 1)
     assert conversation.link.cause is LinkCause.SETTINGS
 
 
-def test_a_board_reset_by_opening_is_asked_again() -> None:
+def test_a_board_that_resets_on_opening_is_pinged_again() -> None:
     conversation = opened()
     assert said(conversation, T0) == [Stop(), Ping(42)]
     assert said(conversation, T0) == []
@@ -109,7 +113,7 @@ def test_a_board_reset_by_opening_is_asked_again() -> None:
     assert said(conversation, T0) == [Stop(), Ping(43)]
 
 
-def test_a_bridge_reset_in_the_middle_is_greeted_again() -> None:
+def test_a_bridge_that_resets_while_sweeping_loses_the_link() -> None:
     conversation = greeted()
     sent = [encode(message) for message in (sweep(0, 10_000), hello(0), sweep(1, 20_000))]
     assert len(conversation.receive(b"".join(sent), T0 + S)) == 1
@@ -117,14 +121,14 @@ def test_a_bridge_reset_in_the_middle_is_greeted_again() -> None:
     assert conversation.counters.restarts == 1
 
 
-def test_a_bridge_that_changes_its_sampling_is_greeted_again() -> None:
+def test_a_bridge_that_changes_its_sampling_loses_the_link() -> None:
     conversation = greeted(hello(0, period_ms=50))
     changed = hello(0, period_ms=50, channels=SEQUENCES["all"])
     answer(conversation, changed, T0 + 247 * MS)
     assert conversation.link.reason == "the bridge changed what it samples"
 
 
-def test_a_bridge_whose_clock_stands_is_greeted_again() -> None:
+def test_a_bridge_whose_clock_stands_loses_the_link() -> None:
     conversation = greeted()
     made = [hear(conversation, sweep(number, 10_000), T0 + 20 * MS) for number in range(2)]
     assert list(map(len, made)) == [1, 0]
@@ -160,7 +164,7 @@ def words_of(conversation: Conversation) -> dict[str, str]:
         (("", "", ""), (0, 0, 0), Fact("none, none, none", DeviceFault.NO_SENSOR), Fact("-, -, -")),
     ],
 )
-def test_sensors_that_are_absent_twice_or_misread_are_a_fault(
+def test_absent_duplicate_or_misread_sensors_are_described_as_faults(
     serials: tuple[str, ...], numbers: tuple[int, ...], sensors: Fact, errors: Fact
 ) -> None:
     conversation = greeted(dataclasses.replace(hello(0), serials=serials))
@@ -213,13 +217,15 @@ def test_the_link_description_shows_the_bridges_clock() -> None:
     ("firmware", "newer"),
     [(FIRMWARE - 1, "0.2"), (FIRMWARE, None), (FIRMWARE + 1, None)],
 )
-def test_the_link_description_names_newer_firmware_only(firmware: int, newer: str | None) -> None:
+def test_the_link_description_names_firmware_newer_than_the_bridges(
+    firmware: int, newer: str | None
+) -> None:
     conversation = greeted(dataclasses.replace(hello(0), firmware=firmware))
     fact = None if newer is None else Fact(newer, DeviceFault.OLD_FIRMWARE)
     assert conversation.describe().get("newer firmware") == fact
 
 
-def test_a_bridges_counters_are_shown_and_echoes_are_unknown() -> None:
+def test_bridge_counters_are_copied_and_an_echo_counts_as_unknown() -> None:
     conversation = greeted()
     hear(conversation, BridgeStatus(1, 2, 3, 4, 5, (6,)), T0)
     hear(conversation, Ping(7), T0)
@@ -229,7 +235,7 @@ def test_a_bridges_counters_are_shown_and_echoes_are_unknown() -> None:
 
 
 @pytest.mark.parametrize(("kind", "bad"), [(1, 1), (2, 1), (3, 1), (4, 0), (0x84, 0)])
-def test_a_frame_makes_no_sense_or_its_type_is_unknown(kind: int, bad: int) -> None:
+def test_frames_with_bad_content_and_unknown_types_are_counted_apart(kind: int, bad: int) -> None:
     conversation = opened()
     digest = 0 if kind == 1 else DIGEST
     assert conversation.receive(encode_frame(kind, b"x", digest), T0) == []
@@ -248,7 +254,7 @@ def test_a_frame_makes_no_sense_or_its_type_is_unknown(kind: int, bad: int) -> N
         ((0, 0), 1, {"duplicates": 1}),
     ],
 )
-def test_numbers_of_sweeps_go_round_and_begin_anywhere(
+def test_missed_reordered_and_duplicate_sweeps_are_counted_by_number(
     numbers: tuple[int, ...], taken: int, counted: dict[str, int]
 ) -> None:
     conversation = greeted()
@@ -323,7 +329,7 @@ def test_changed_serial_numbers_stop_readings_until_two_hellos_agree(
     assert tuple(conversation.serials.values()) == serials
 
 
-def test_a_silent_sensor_was_not_exchanged() -> None:
+def test_a_sensor_silent_in_one_hello_keeps_the_link_up() -> None:
     conversation = opened()
     for _ in range(2):
         told(conversation, SERIALS, T0)

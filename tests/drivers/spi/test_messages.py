@@ -61,7 +61,7 @@ def test_a_frame_has_its_golden_bytes(kind: int, payload: bytes, wire: str) -> N
     assert FrameParser().feed(bytes.fromhex(wire)) == [(kind, payload)]
 
 
-def test_a_frame_of_another_layout_fails() -> None:
+def test_a_frame_of_another_digest_fails_the_checksum() -> None:
     parser = FrameParser(0x1234)
     assert parser.feed(encode_frame(0x02, b"abc", 0x1235)) == []
     assert parser.feed(encode_frame(0x02, b"abc")) == []
@@ -169,7 +169,7 @@ def test_a_message_has_its_golden_bytes_and_comes_back(
     ],
     ids=str,
 )
-def test_a_hello_that_makes_no_sense_is_nothing(changes: dict[str, int]) -> None:
+def test_a_hello_with_a_forbidden_field_decodes_to_none(changes: dict[str, int]) -> None:
     fields = {"version": 1, "tick_hz": 1_000_000, "period_ticks": 9, "sensors": 2, "slots": 3}
     fields = {**fields, "command": 0xA2, **changes}
     payload = struct.pack("<BIIQ", fields["version"], DIGEST, 1, 2)
@@ -192,10 +192,10 @@ def test_a_hello_that_makes_no_sense_is_nothing(changes: dict[str, int]) -> None
         (3, 1, 0, (2, 1), False),
     ],
 )
-def test_a_sweep_that_makes_no_sense_is_nothing(
+def test_only_a_sweep_within_the_limits_is_decoded(
     sensors: int, slots: int, present: int, ticks: tuple[int, int], sense: bool
 ) -> None:
-    """However well its length fits."""
+    """The length fits in all cases."""
     payload = struct.pack("<IQQBBB", 7, *ticks, present, sensors, slots)
     assert (decode(0x02, payload + bytes(2 * sensors * slots)) is not None) == sense
 
@@ -212,7 +212,7 @@ def test_the_layout_of_a_later_version_can_be_read() -> None:
     assert layout_of(later[:4]) is None
 
 
-def test_strange_bytes_in_a_serial_number_break_no_hello() -> None:
+def test_unprintable_bytes_in_a_serial_number_become_question_marks() -> None:
     payload = bytearray(HELLO.to_bytes())
     start = payload.index(b"BTSP")
     payload[start : start + 5] = b"B\xff\n\x80P"

@@ -44,7 +44,7 @@ def test_a_port_name_that_cannot_exist_is_refused(port: str) -> None:
         SpiBridgeDriver(possible, FINGERS)
 
 
-def test_the_greeting_is_that_of_the_protocol(rig: Rig) -> None:
+def test_opening_sends_stop_and_ping_then_start_when_answered(rig: Rig) -> None:
     said = rig.greet()
     assert [type(message) for message in said] == [Stop, Ping]
     assert [type(message) for message in rig.bridge.heard(Start)] == [Start]
@@ -68,7 +68,7 @@ REFUSALS = [
 
 
 @pytest.mark.parametrize(("answer", "why"), REFUSALS, ids=["version", "layout"])
-def test_a_bridge_of_another_version_is_refused_in_one_line(
+def test_a_bridge_of_another_version_is_refused_with_one_warning(
     rig: Rig, caplog: pytest.LogCaptureFixture, answer: bytes, why: str
 ) -> None:
     rig.driver.open()
@@ -142,7 +142,9 @@ def test_a_bridge_that_does_not_read_never_blocks_the_host(rig: Rig) -> None:
     line.close()
 
 
-def test_frames_that_find_no_room_are_counted(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_without_room_in_the_port_are_counted_dropped(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(SerialLine, "write", lambda _line, _frame: False)
     rig.driver.open()
     assert rig.driver.counters.host_tx_dropped == len([Stop, Ping])
@@ -170,7 +172,7 @@ def test_a_link_broken_within_a_frame_comes_back(tmp_path: Path) -> None:
     assert seqs == sorted(set(seqs))
 
 
-def test_only_a_dead_link_is_replaced(tmp_path: Path) -> None:
+def test_a_twin_replaces_a_dead_symlink_but_no_live_one(tmp_path: Path) -> None:
     path = tmp_path / "bridge"
     path.symlink_to("/dev/pts/of-a-twin-that-was-killed")
     with SpiTwin(path, sweeps_of(1)) as first:
@@ -186,7 +188,7 @@ def test_only_a_dead_link_is_replaced(tmp_path: Path) -> None:
 
 
 class Port:
-    """What pyserial opens: reads `incoming`, and has `waiting` values for bytes still to go."""
+    """Stand-in for a port of pyserial that reads `incoming`. `waiting`: numbers of unsent bytes."""
 
     def __init__(self, incoming: bytes = b"", waiting: tuple[int, ...] = ()) -> None:
         self.incoming, self.waiting = incoming, list(waiting)

@@ -35,7 +35,9 @@ def test_a_sweep_becomes_a_reading_by_slot_and_sensor(channels: tuple[int, ...])
     ("sensors", "columns"),
     [(("th", "mf", "ff"), [2, 1, 0]), (("mf", "th", "ff"), [2, 0, 1])],
 )
-def test_the_wiring_order_changes_no_reading(sensors: tuple[str, ...], columns: list[int]) -> None:
+def test_sensors_are_read_in_finger_order_whatever_the_wiring(
+    sensors: tuple[str, ...], columns: list[int]
+) -> None:
     conversation = greeted(sensors=sensors)
     present = 7 & ~(1 << columns[2])
     (reading,) = hear(conversation, sweep(0, 100, present), T0)
@@ -78,13 +80,13 @@ def test_a_sweep_from_before_stop_is_stale() -> None:
     assert never_started.counters.stale_sweeps == 1
 
 
-def test_a_sweep_unlike_the_hello_is_bad() -> None:
+def test_a_sweep_unlike_the_hello_is_counted_bad() -> None:
     conversation = greeted()
     assert hear(conversation, sweep(0, 10_000, read=words(slots=23)), T0) == []
     assert conversation.counters.bad_frames == 1
 
 
-def test_a_bridge_that_is_started_again_interrupts() -> None:
+def test_the_first_reading_after_a_restart_is_marked_interrupted() -> None:
     counters, interrupted = BridgeCounters(), []
     for sweeps in (1, 3):
         decoder = SweepDecoder(hello(0), (0, 1, 2), counters, DeviceClock(1_000_000, 0, 0, 0))
@@ -115,7 +117,7 @@ class Way:
     lag_ms: float = 0.0
     """Delay of every message, both ways, as of a line that is full."""
     drifts_ppm: tuple[float, ...] = (0.0,)
-    """How much the device's clock is fast, second by second, again and again."""
+    """Drift of the device's clock in each second, above 0 if fast; repeated from the start."""
     stall_probability: float = 0.0
     """Chance that a message waits for up to a second more, on either way."""
     tick_hz: int = TICK_HZ
@@ -169,8 +171,8 @@ def events(way: Way, duration_s: int) -> Iterator[Event]:
 def too_old_ns(way: Way, duration_s: int) -> Iterator[tuple[int, int]]:
     """Yield by how much each sweep after the first answer looks too old, and the most allowed.
 
-    The most is the way of a PING to the device, half a thousandth of the time since, by what the
-    rate may be wrong on top of how it is wrong, and two ticks.
+    The most is the time that a PING took to the device, a thousandth of the time since (half for
+    the real drift, half for the assumed one), and two ticks; the best of the last eight PINGs.
     """
     pings: list[tuple[int, int]] = []
     clock = None
@@ -218,7 +220,7 @@ def test_with_batches_a_time_is_right_to_two_milliseconds(drift_ppm: float) -> N
 
 
 def exact(pings: int, wrong_ppm: int = 0) -> tuple[DeviceClock, int]:
-    """A clock after PINGs that took no time, one a second; host time of the last, ns."""
+    """A clock after PINGs that took no time, one a second, and the host time of the last, ns."""
     clock = DeviceClock(TICK_HZ, TICK_HZ, START_NS, START_NS)
     for second in range(1, pings):
         now_ns = START_NS + second * S
@@ -227,7 +229,7 @@ def exact(pings: int, wrong_ppm: int = 0) -> tuple[DeviceClock, int]:
 
 
 @pytest.mark.parametrize("tick", [0, TICK_HZ, 3 * TICK_HZ + 5000])
-def test_a_clock_that_does_not_move_on_is_wrong(tick: int) -> None:
+def test_a_clock_that_stands_or_falls_back_raises(tick: int) -> None:
     """Reset, or standing since the first PING or the last reading."""
     clock, now_ns = exact(3)
     clock.host_ns(3 * TICK_HZ + 5000, now_ns + 5 * MS)
@@ -236,7 +238,7 @@ def test_a_clock_that_does_not_move_on_is_wrong(tick: int) -> None:
 
 
 @pytest.mark.parametrize(("ahead_us", "is_wrong"), [(6, False), (7, True)])
-def test_a_clock_ahead_of_its_readings_is_doubted(ahead_us: int, is_wrong: bool) -> None:
+def test_a_clock_ahead_of_its_readings_arrivals_is_doubted(ahead_us: int, is_wrong: bool) -> None:
     clock, now_ns = exact(3)
     arrival_ns = now_ns + 10 * MS  # wrong by 5 us at most, and by a tick
     tick = 3 * TICK_HZ + 10_000 + ahead_us
@@ -248,7 +250,7 @@ def test_a_clock_ahead_of_its_readings_is_doubted(ahead_us: int, is_wrong: bool)
 
 
 @pytest.mark.parametrize("wrong_ppm", [-501, -499, 499, 501])
-def test_a_rate_wrong_by_500_ppm_is_a_fault(wrong_ppm: int) -> None:
+def test_a_rate_wrong_by_over_500_ppm_is_doubted(wrong_ppm: int) -> None:
     clock, now_ns = exact(11, wrong_ppm)
     assert clock.is_doubted == (abs(wrong_ppm) > 500)
     tick = 11 * TICK_HZ + 10 * wrong_ppm
@@ -266,8 +268,8 @@ def test_a_clock_that_stood_after_a_short_ping_is_doubted() -> None:
 
 
 @given(st.floats(-80_000.0, 80_000.0), st.integers(0, 99))
-def test_a_wrong_rate_makes_no_reading_20_ms_newer(wrong_ppm: float, seed: int) -> None:
-    """Rates are wrong while a computer's time is set; round trips hide less than their length."""
+def test_a_wrong_rate_makes_no_reading_20_ms_too_new(wrong_ppm: float, seed: int) -> None:
+    """Rates are wrong while a computer's time is set; PINGs show it to within a round trip."""
     too_old = [ns for ns, _ in too_old_ns(Way(drifts_ppm=(wrong_ppm,), seed=seed), 5)]
     assert min(too_old) >= -DOUBT_NS
 
@@ -280,7 +282,7 @@ def test_a_wrong_rate_hides_no_age_on_a_slow_line(wrong_ppm: float, lag_ms: floa
     assert min(too_old) >= 0
 
 
-def test_a_time_by_a_wrong_bound_is_not_kept() -> None:
+def test_times_fall_back_after_a_ping_corrects_a_wrong_bound() -> None:
     """The clock gained 90 ms where readings come 150 ms late; a PING shows it."""
     clock, now_ns = exact(3)
     tick = 3 * TICK_HZ + 90_000
@@ -297,7 +299,7 @@ def test_no_reading_is_older_than_ten_seconds() -> None:
 
 
 @given(ways, st.integers(3 * S, 3600 * S), st.booleans())
-def test_a_clock_that_jumps_is_wrong_at_once(way: Way, jump_ns: int, back: bool) -> None:
+def test_a_clock_that_jumps_raises_at_once(way: Way, jump_ns: int, back: bool) -> None:
     """A computer that slept, whose clock stood meanwhile; a counter that wraps or is reset."""
     clock = DeviceClock(way.tick_hz, way.tick(START_NS), START_NS, START_NS + S)
     sweeps = [event for event in events(way, 5) if event.sent_ns is None]
