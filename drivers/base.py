@@ -300,7 +300,7 @@ class LinkError(DriverError):
 
     @classmethod
     def from_errno(cls, error: BaseException, text: str, endpoint: str | None = None) -> LinkError:
-        """Return an error whose cause follows from `errno` of `error` or its causes, or is unknown."""
+        """Return an error with the cause by `errno` of `error` or its causes, else `UNKNOWN`."""
         reason: BaseException | None = error
         while reason is not None:
             cause = _CAUSES.get(getattr(reason, "errno", None))

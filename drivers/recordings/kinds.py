@@ -210,7 +210,7 @@ def _kind_of(head: bytes) -> Kind | None:
 
 
 def encoding_of(head: bytes) -> str | None:
-    """Return the encoding of text, by byte order mark or zeros in every other byte; None: no sign."""
+    """Return the encoding by byte order mark, or zeros in every other byte; None without either."""
     for mark, name in _MARKS.items():
         if head.startswith(mark):
             return name

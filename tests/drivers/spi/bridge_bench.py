@@ -142,7 +142,7 @@ def answer(conversation: Conversation, about: Hello, now_ns: int = T0) -> None:
 
 
 def told(conversation: Conversation, serials: tuple[str, ...], now_ns: int) -> None:
-    """Let a HELLO with these serial numbers answer the due PING; reopen the link if that loses it."""
+    """Let a HELLO with these serial numbers answer the due PING; reopen a link that is lost."""
     about = dataclasses.replace(hello(0, period_ms=50), serials=serials)
     answer(conversation, about, now_ns)
     if conversation.link.state is LinkState.WAITING:
@@ -181,7 +181,7 @@ class Rig:
     clock: Clock
 
     def greet(self) -> list[Message]:
-        """Open the driver and answer two PINGs, so that it sends START; return its first messages."""
+        """Open the driver and answer two PINGs; return its messages up to the first of them."""
         self.driver.open()
         first = self._answered()
         self._answered()
