@@ -1,4 +1,4 @@
-"""A table of grasps, 25 a line, that compares the published method and graspd by outcomes."""
+"""A table that compares the published method and graspd by outcomes, a line per 25 grasps."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from graspd.models.judge.grasp_judge import Examined, GraspJudge
 from graspd.models.runtime import TactileModel
 
 GRASPS = 25
-"""Grasps of one line."""
+"""Number of grasps that one line counts."""
 PUBLISHED = "cnn1"
 """Name of the published network in the zoo."""
 COLUMNS = f"{'stable':>7}{'slipped':>11}{'good lifts kept':>17}"
@@ -28,7 +28,7 @@ class DayTable(Companion):
     ) -> None:
         """`published`: network that judges each grasp without session, outcomes or refusal.
 
-        `model`: name of graspd's model. `warnings`: lines to write above the figures.
+        `model`: name of graspd's model. `title`, `warnings`: lines to write above the figures.
         """
         self._published = GraspJudge.of(published)
         self._part = Tally(), Tally()
@@ -44,7 +44,7 @@ class DayTable(Companion):
         )
 
     def on_verdict(self, published: PublishedVerdict) -> None:
-        """Count the grasp of a verdict; write a line if it is complete."""
+        """Count a grasp whose outcome is recorded; write a line after each `GRASPS` of them."""
         verdict, reading = published.verdict, published.reading
         note = None if reading is None else reading.annotation
         if reading is None or note is None or note.slipped is None:
@@ -67,7 +67,7 @@ class DayTable(Companion):
         self._part = Tally(), Tally()
 
     def summary(self, trust: Trust | None) -> None:
-        """Write the last lines; `trust` is what outcomes have taught."""
+        """Write the totals. `trust`: what outcomes taught; None: the run does not learn."""
         report = None if trust is None else trust.report()
         allowed = None if report is None else report.target
         if self._part[0].labelled:

@@ -45,11 +45,11 @@ REFUSALS: Final = {
 STATUS_PERIOD_NS: Final = 1_000_000_000
 """Time between two status messages, ns."""
 SILENCE_PERIODS: Final = 10
-"""Number of missing readings that count as silence, if their time is above the age limit."""
+"""Number of missing readings that count as silence; never in less time than the age limit."""
 DRAINS_MAX: Final = 8
 """Most extra reads of the driver in one round, so that a flood cannot hold the loop."""
 BLOCKED_NS: Final = 50_000
-"""Difference of a wait's duration and processor time from which on the thread slept, ns."""
+"""Duration of a wait without its processor time, ns, from which on the loop counts as idle."""
 
 
 class Ended(Enum):
@@ -75,7 +75,7 @@ class LoopTiming:
     """Clock that returns monotonic ns."""
     sleep: Sleep = field(default_factory=Sleep)
     rest: Callable[[float], None] = time.sleep
-    """Function that puts this thread to sleep, s."""
+    """Function that puts this thread to sleep for a number of seconds."""
     selector: Callable[[], selectors.BaseSelector] = POLL
     """Selector: `POLL`, which waits in whole milliseconds.
 
@@ -202,7 +202,7 @@ class Loop:
         self._watched = watched
 
     def _take_readings(self) -> bool:
-        """Judge and publish the waiting readings; return False if no tactile reading waited."""
+        """Judge and publish the waiting readings, or skip some; return False if none was judged."""
         readings, backlog = self._read()
         received_ns = began_ns = self._clock()
         taken = False
@@ -252,7 +252,7 @@ class Loop:
     def _after_skipped(
         self, skipped: Sequence[TactileReading], newest: TactileReading
     ) -> TactileReading:
-        """Report skipped readings; return `newest`, with repeats of them marked."""
+        """Report skipped readings; return `newest`, marked where it repeats the last of them."""
         self._shedder.skip(len(skipped), self._clock())
         self._interrupt()
         return mark_repeats(newest, skipped[-1])
@@ -264,7 +264,7 @@ class Loop:
             on_event(LoopEvent.SKIPPED)
 
     def _judge(self, reading: TactileReading, received_ns: int) -> bool:
-        """Judge and publish a reading; return False if the computer slept since it arrived."""
+        """Judge and publish a reading; if the computer slept meanwhile, only return False."""
         judgement = self._pipeline.judge(reading)
         if self._sleep.has_slept():
             return False
@@ -344,7 +344,7 @@ class Loop:
         self._report_silence(self._clock())
 
     def outcome(self, report: Report, answer: Answer) -> None:
-        """Learn, publish and save the outcome of a judged grasp's lift; then call `answer`."""
+        """Learn, publish and save the outcome of a lift; call `answer` once saved or refused."""
         lifts, grasp = self._pipeline.lifts, report.grasp
         if grasp.boot_id == self._outbox.boot_id:  # the lift book of a replay has the recorded ids
             grasp = GraspId(self._pipeline.boot_id, grasp.grasp)

@@ -20,7 +20,7 @@ from graspd.drivers.base import ElectrodeFault, TactileReading
 BACKLOG_MAX_NS: Final = 10_000_000
 """Longest backlog whose readings are all judged, ns; one sensor period if that is longer."""
 COST_SAMPLES: Final = 4
-"""Number of latest readings. The shortest of their times is the cost, so a stall does not count."""
+"""Number of latest readings whose shortest time to judge is the cost, so a stall does not count."""
 REPORT_AFTER_NS: Final = 3_000_000_000
 """Duration of skipping after which overload is reported, ns."""
 PAUSE_NS: Final = 1_000_000_000
@@ -57,12 +57,12 @@ class LoadShedder:
         """True while skipping lasts, and until `RECOVERED_AFTER_NS` after it."""
 
     def waited(self, now_ns: int) -> None:
-        """Call after the loop has waited for input."""
+        """Note that the loop waited for input until `now_ns`; end an overload that is over."""
         self._waited_ns = now_ns
         self._check_recovered(now_ns)
 
     def yield_processor(self, now_ns: int) -> None:
-        """Call after a round without a wait: sleep a little if the loop has worked for long."""
+        """Sleep a little if the loop has worked for long; call it after a round without a wait."""
         worked_ns = now_ns - self._waited_ns
         if worked_ns >= self._yield_after_ns:
             self._sleep(min(worked_ns // YIELD_SHARE, YIELD_MAX_NS) / 1e9)
@@ -84,7 +84,7 @@ class LoadShedder:
         self._costs_ns.append(cost_ns)
 
     def skip(self, readings: int, now_ns: int) -> None:
-        """Count skipped readings, and report an overload if that lasts."""
+        """Add to the number of skipped readings; report an overload if skipping lasts."""
         self.skipped_readings += readings
         if now_ns - self._skipped_ns >= PAUSE_NS:
             self._skipping_since_ns = now_ns

@@ -19,7 +19,7 @@ PERIOD_NS = 10_000_000
 REST = 110
 """Number of untouched readings before the first grasp; a tare takes 100."""
 GRASP_EVERY, CLOSING, HELD = 65, 5, 45
-"""Readings of a whole grasp, of closing or opening, and of holding."""
+"""Numbers of readings of a whole grasp, of closing or opening, and of holding."""
 FALL_COUNTS = 150.0
 """Unit of an electrode's fall, counts; in a typical grasp it falls by 0 to 3 units."""
 COUNTS_MAX = 4000.0
@@ -27,7 +27,10 @@ COUNTS_MAX = 4000.0
 
 
 def grasps(training: SeenCounts, readings: int) -> Iterator[NDArray[np.uint16]]:
-    """Yield counts, shape (fingers, 24): a rest to tare, then grasps like those of `training`."""
+    """Yield counts, shape (fingers, 24): a rest to tare, then grasps like those of `training`.
+
+    `readings`: number of counts after the rest.
+    """
     # The grasp is one standard deviation off along each axis, as the centre is unlike any grasp.
     sides = 1.0 - 2.0 * (np.arange(np.size(training.centre)) % 2)
     away = np.linalg.solve(training.whitening_matrix().T, sides)

@@ -23,7 +23,7 @@ from graspd.models.runtime import TactileModel
 class _Lift(NamedTuple):
     report: Report
     allowed: bool
-    """True if the verdict was `stable` or requested a supervised lift."""
+    """True if a verdict on the grasp was `stable` or requested a supervised lift."""
     over: bool
     """True if the next reading is certainly another grasp."""
 
@@ -65,7 +65,7 @@ class Controller(Companion):
             self.tell()
 
     def tell(self) -> None:
-        """Report the outcome of the current lift, if it has one."""
+        """Report the recorded outcome of the current grasp, if `only_lifted` permits it."""
         lift, self._lift = self._lift, None
         if lift is None or self._requests is None or (self._only_lifted and not lift.allowed):
             return

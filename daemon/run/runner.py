@@ -29,7 +29,10 @@ log = logging.getLogger("graspd")
 
 
 def prepare(path: Path) -> Parts:
-    """Read a scene and load its model; with `[realtime]` rehearse. Raises as `Parts.of`."""
+    """Read a scene and load its model; with `[realtime]` also judge a synthetic grasp.
+
+    Raises `SceneError`, `ModelError` or `RecordingError`.
+    """
     loaded = scene.load(path)
     model = assembly.load_model(loaded)
     parts = Parts.of(Plan.of(loaded), model)
@@ -55,7 +58,7 @@ def enter_realtime(running: scene.Scene, stack: ExitStack) -> RealtimeMode | Non
 
 
 def _controller(wanted: scene.Scene) -> Controller | None:
-    """Return the controller that reports recorded outcomes; None if the scene has none."""
+    """Return the controller that reports recorded outcomes; None without `tactile.outcomes`."""
     if not isinstance(wanted.tactile, ReplayTactile) or not wanted.tactile.outcomes:
         return None
     from graspd.daemon.run.replaying import Controller  # imported only if it is used

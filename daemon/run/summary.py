@@ -22,7 +22,7 @@ NAME_MAX = 80
 """Most printed characters of an object's name."""
 COLOURS = {Decision.STABLE: Colour.GREEN, Decision.SLIP: Colour.RED}
 WINDOW: Final = 50
-"""Number of `stable` lifts in a row for the figure `worst`."""
+"""Number of `stable` lifts in a row among which `Tally.worst` counts the slips."""
 WAITING_MAX: Final = 1024
 """Most grasps that wait for their outcome."""
 WORTH: Final = {
@@ -56,7 +56,7 @@ class Tally:
 
     @property
     def stable(self) -> tuple[int, int]:
-        """`stable` lifts with a known outcome, and the slips among them."""
+        """Number of `stable` lifts with a known outcome, and of the slips among them."""
         slips = self.confusion[True, False]
         return slips + self.confusion[False, False], slips
 
@@ -95,7 +95,7 @@ class Tally:
         )
 
     def worth(self) -> dict[str, float] | None:
-        """Return coverage and slip rates of `stable`; None: no lift has a known outcome."""
+        """Return the figures named in `WORTH`, 0..1, except those of 0 lifts. None: no outcome."""
         if not self.labelled:
             return None
         (stable, slips), held = self.stable, self.confusion[False, False]
@@ -242,12 +242,12 @@ class RunSummary:
 
 
 def trained_on_line(which: str, known: Iterable[str]) -> str:
-    """Return the warning for recordings that a model was trained on."""
+    """Return the warning that model `which` was trained on the grasps in the texts `known`."""
     return f"{which} was trained on {', '.join(known)}: it judges other grasps worse than these"
 
 
 def _learned(trust: Trust | None) -> Iterator[str]:
-    """Yield lines for people: what was learned from outcomes, and the risk."""
+    """Yield lines on what outcomes taught, and on the risk; none before the first outcome."""
     if trust is None or not trust.lifts.told:
         return
     yield f"learned from {trust.learner.outcomes} outcomes"
@@ -272,7 +272,7 @@ class Printer(Companion):
         self._gate: GateState | None = None
 
     def on_verdict(self, published: PublishedVerdict) -> None:
-        """Print a verdict, and the recorded outcome of its lift, if there is one."""
+        """Count a verdict. Print it, with a recorded outcome, if it is news or with `as_json`."""
         verdict, reading = published.verdict, published.reading
         annotation = reading.annotation if reading else None
         self.result.add(verdict, annotation.slipped if annotation else None, published.grasp)
@@ -283,7 +283,7 @@ class Printer(Companion):
         sys.stdout.flush()  # also into a pipe, because readings may come in real time
 
     def _is_news(self, verdict: Verdict) -> bool:
-        """Return True if the verdict differs from the last; without a gate it is always new."""
+        """Return True for a new judgement, a change of the gate's state, and without a gate."""
         if verdict.gate is None or verdict.judged or verdict.gate is not self._gate:
             self._gate = verdict.gate
             return True

@@ -18,7 +18,7 @@ from graspd.daemon.publish.companion import Companion, PublishedVerdict
 from graspd.drivers.base import ANGLE_MAX_RAD, DriverCounters, JointReading, Reading
 
 STEPS: Final = 20
-"""Number of steps between readings whose median is the usual step."""
+"""Number of the first steps between readings, whose median is the usual step."""
 STEP_MAX_S: Final = GAP_NS / 2e9
 """Longest usual step, s. With a longer one each lost reading is a gap, after which a grasp must
 settle again."""
@@ -59,7 +59,7 @@ class Unjudged(Companion):
         """Number of unjudged grasps by their most frequent reason."""
 
     def on_reading(self, reading: Reading) -> None:
-        """Look at the angles of joints."""
+        """Report the first angle that no joint can have."""
         if isinstance(reading, JointReading) and self._angle is None:
             self._look_at_angles(reading)
 
@@ -87,9 +87,9 @@ class Unjudged(Companion):
             self._now.update(judgement.reasons)
 
     def end(self, counters: DriverCounters | None = None) -> None:
-        """Say why nothing, or little, was judged.
+        """Say why no grasp, or less than half of them, was judged; else say nothing.
 
-        `counters`: what the driver counted.
+        `counters`: the driver's, to show if no reading came; None: not known.
         """
         self._end_grasp()
         missed = self.not_judged.total()
@@ -112,7 +112,7 @@ class Unjudged(Companion):
         self._now.clear()
 
     def _causes(self, counters: DriverCounters | None) -> Iterator[str]:
-        """Yield the causes. Those that explain all others stand alone."""
+        """Yield the causes, as texts. A cause that explains all others stands alone."""
         if not self.readings:
             yield "no reading came of it: is it of another sensor, bus or board?"
             counts = {} if counters is None else counters.as_dict()
@@ -157,7 +157,7 @@ class Unjudged(Companion):
         self._last_ns = made_ns
 
     def _step_in_words(self) -> str | None:
-        """Return text on what is wrong with the times of the readings; None: nothing."""
+        """Return text on readings that are too close together or too far apart; None: neither."""
         if not self._steps_s or not self._fingers:
             return None
         step_s = median(self._steps_s)
