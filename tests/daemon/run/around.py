@@ -1,4 +1,4 @@
-"""What is around a daemon in simulated time: clock, disk, door and controllers."""
+"""Stand-ins for what is around a daemon, in simulated time: clock, disk, sockets, peers."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from tests.kit.clock import Clock
 
 S = 1000 * MS
 PATIENCE_NS, SLACK_NS = S, 25 * MS
-"""Longest time to an answer, and what a message may be late where a round takes no time."""
+"""Longest wait for an answer, and how late a message may come after its limit, ns."""
 
 
 class KilledError(BaseException):
-    """The daemon was killed: nothing in it catches this."""
+    """Ends the daemon as a kill does: no code in it catches a `BaseException`."""
 
 
 class World(Clock):
-    """Time, and what happens at which time."""
+    """A simulated clock, with the actions that are due at given times."""
 
     def __init__(self, seed: int) -> None:
         super().__init__()
@@ -41,7 +41,7 @@ class World(Clock):
 
     @property
     def worked_ns(self) -> int:
-        """Time without that."""
+        """Time without `away_ns`, ns; never goes back."""
         self._worked_ns = max(self._worked_ns, self.now_ns - self.away_ns)
         return self._worked_ns
 
@@ -49,7 +49,7 @@ class World(Clock):
         heapq.heappush(self._due, (self.now_ns + ns, next(self._numbers), do))
 
     def pump(self) -> None:
-        """Have happen what is due, each at its time."""
+        """Run the actions that are due; the clock shows to each its own time."""
         now_ns = self.now_ns
         while self._due and self._due[0][0] <= now_ns:
             self.now_ns, _, do = heapq.heappop(self._due)
@@ -59,7 +59,7 @@ class World(Clock):
         self.now_ns = now_ns
 
     def wait(self, ns: int) -> None:
-        """Wait until something happens."""
+        """Move time to the next action, by `ns` at most. Raises `KilledError` if a kill is due."""
         until_ns = min(self.now_ns + ns, self._due[0][0])
         if self.kill_ns is not None and self.kill_ns <= until_ns:
             self.kill_ns = None
@@ -77,7 +77,7 @@ class World(Clock):
 
 
 class Selector(selectors.SelectSelector):
-    """Moves time instead of waiting."""
+    """Selector that moves the simulated time instead of waiting, unless a question waits."""
 
     def __init__(self, world: World, door: Door) -> None:
         super().__init__()
@@ -128,7 +128,7 @@ class Disk:
         return True
 
     def kill(self) -> None:
-        """Write no more; what is being written is there, or is not (never half: test_folder)."""
+        """End as by a kill: a running save is done or not, never in part (see test_folder)."""
         self.is_dead = True
         if self._job is not None and self.world.random.random() < 0.5:
             with suppress(Exception):
@@ -202,7 +202,7 @@ class Controller:
             self.world.after(after_ms * MS, partial(self.tell, grasp, outcome))
 
     def _may_kill(self) -> None:
-        """Now something could be lost."""
+        """Kill the daemon soon, in one call of ten: what was just acknowledged could be lost."""
         if self.world.random.random() < 0.1:
             self.world.kill_soon()
 
@@ -237,7 +237,7 @@ class Door:
         return self
 
     def shut(self) -> None:
-        """Have peers see that the daemon is gone: they tell again, and do not wait."""
+        """Have peers see that the daemon is gone: they report again, and drop their questions."""
         self.is_open = False
         self.questions.clear()
         for peer in self.all:
@@ -249,7 +249,7 @@ class Door:
         return 1
 
     def check(self) -> None:
-        """Nothing ends here."""
+        """Do nothing: this process never ends or hangs."""
 
     def send(self, topic: bytes, payload: bytes) -> bool:
         if self.is_open:

@@ -46,16 +46,16 @@ from tests.kit.messages import decode_status, decode_verdict
 
 AGE_NS = AGE_MAX_MS * MS
 MOVED_COUNTS = 40.0
-"""Step of counts that is motion: grasps are further apart."""
+"""Mean change of a finger's counts that is motion; different grasps differ by more."""
 SAID_AFTER_NS = 1300 * MS
-"""A fault that lasts this long is in the status."""
+"""Longest time until a lasting fault is in the status, ns."""
 ROUNDS_MAX = 1000
-"""Rounds at one time: a flood of questions takes forty."""
+"""Most rounds of the loop at one simulated time: a flood of questions takes forty."""
 TROUBLE_NS, CALM_NS = 12 * S, 9 * S
 OPEN_MS = 100
-"""A hand that must be tared is opened, and stays open for this long after it was reported."""
+"""Time for which the hand stays open after each verdict with the reason `not-tared`, ms."""
 WITHHELD = {"low-confidence", "unproven", "risk-exceeded", "not-calibrated", "never-seen"}
-"""Reasons for which a sound, settled grasp may be `unknown`: outcomes and grasps before it."""
+"""Reasons for which a sound, settled grasp may be `unknown`, by earlier outcomes and grasps."""
 
 
 @cache
@@ -64,7 +64,7 @@ def model() -> TactileModel:
 
 
 class Watch(Companion):
-    """Checks what the daemon promises; stands for the service manager."""
+    """Checks the daemon's promises in each round; runs in place of the service manager."""
 
     def __init__(self, day: Day) -> None:
         self.day, self.world, self.sensors = day, day.world, day.sensors
@@ -88,7 +88,7 @@ class Watch(Companion):
         )
 
     def ready(self, _text: str) -> None:
-        """All is open."""
+        """Ignore the message that the daemon is ready."""
 
     def on_reading(self, reading: Reading) -> None:
         if self._rest is not self.sensors.rest:
@@ -126,7 +126,7 @@ class Watch(Companion):
         self.world.stall(self.day.cost_ns)
 
     def _lacks(self, reading: TactileReading) -> list[str]:
-        """What the hand lacks."""
+        """Return what the hand lacks for a verdict other than `unknown`, as texts."""
         lacks = self.necessity.lacks()
         if not 0 <= self.world.now_ns - reading.t_ns <= AGE_NS:
             lacks.append("a reading that is not too old")
@@ -172,7 +172,7 @@ class Watch(Companion):
             self._check_health(decode_status(payload))
 
     def _check_health(self, status: Status) -> None:
-        """What was lost is counted, and what has lasted for a while is said."""
+        """Check that a status counts lost readings, and names faults that have lasted."""
         if status.state == "stopping":
             return
         lost = self._given - self._judged - status.skipped_readings
@@ -227,7 +227,7 @@ class Day:
         return scenes.parse(text, folder / "scene.toml")
 
     def run(self, shifts: int) -> None:
-        """Fail if a promise is broken."""
+        """Run the daemon, again after each end, for `shifts` shifts; fail if a promise breaks."""
         self._plan(shifts)
         while not self.is_over:
             with self._replaced():
@@ -238,7 +238,7 @@ class Day:
                 self.world.wait(away_ns - self.world.now_ns)
 
     def _live(self) -> None:
-        """From a start of the daemon to its end."""
+        """Run the daemon from a start to its end, which may be a kill."""
         parts = Parts.of(Plan.of(self.scene), model(), self.sensors, self.world)
         no_signal = cast(StopSignal, SimpleNamespace(received=None, fileno=lambda: 0))
         self.lives += 1
@@ -255,7 +255,7 @@ class Day:
 
     @contextmanager
     def _replaced(self) -> Iterator[None]:
-        """Replace all that has time of its own."""
+        """Replace the daemon's clocks, waits, disk, sockets and random ids in the block."""
         world, ids = self.world, World(1000 * self.seed + self.lives).random
         timing = partial(
             LoopTiming,
@@ -279,7 +279,7 @@ class Day:
             yield
 
     def _check_kept(self, parts: Parts) -> None:
-        """What was acknowledged is known again."""
+        """Check that a new start knows all acknowledged outcomes and offers of lifts."""
         lifts = parts.pipeline.lifts
         for peer in self.door.all:
             for grasp in peer.kept:
@@ -288,7 +288,7 @@ class Day:
                 assert lifts.owns(grasp, peer.known), f"the offer of {grasp} was lost"
 
     def _plan(self, shifts: int) -> None:
-        """Plan some times of trouble, and after each a sound grasp."""
+        """Plan `shifts` times of trouble, and after each a calm time with a sound grasp."""
         for number in range(shifts):
             self.world.after(number * (TROUBLE_NS + CALM_NS), self._have_trouble)
             self.world.after(number * (TROUBLE_NS + CALM_NS) + TROUBLE_NS, self._be_calm)
@@ -346,7 +346,7 @@ class Day:
         self.sensors.take(self.sensors.grasps[0])
 
     def _be_calm(self) -> None:
-        """All works again. The sensors are switched off once: a wrong tare lasts half a minute."""
+        """End all faults; switch the sensors off once, as a wrong tare would last half a minute."""
         self.world.has_trouble, self.world.kill_ns = False, None
         self.sensors.faults.clear()
         self.sensors.switch_off()
@@ -364,7 +364,7 @@ class Day:
 
 
 def run(seed: int, shifts: int = 3) -> Day:
-    """Run a day. The failure names the command that runs it again."""
+    """Run a day of `shifts` times of trouble. A failure names the command that repeats it."""
     with tempfile.TemporaryDirectory() as folder:
         day = Day(seed, Path(folder))
         try:
@@ -376,7 +376,7 @@ def run(seed: int, shifts: int = 3) -> Day:
 
 
 def main() -> None:
-    """Print what came of each day, up to the first that fails."""
+    """Run the days of the given seeds and print the counts of each, up to the first failure."""
     first, *last = map(int, sys.argv[1:])
     for seed in range(first, last[0] if last else first + 1):
         day = run(seed)

@@ -1,6 +1,6 @@
-"""The sensors of a hand in simulated time, which fail as a whole daemon notices it.
+"""The sensors of a hand in simulated time, with faults that last for many readings.
 
-What is wrong with single sweeps is drawn in `tests/daemon/judge/felt_hand.py`.
+Faults of single sweeps are drawn in `tests/daemon/judge/felt_hand.py`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Counts = NDArray[np.int64]
 
 @cache
 def poses() -> tuple[Counts, list[Counts]]:
-    """The open hand, shape (3, 24), and grasps in which each finger touches."""
+    """Return the counts of the open hand, shape (3, 24), and of grasps that all fingers touch."""
     with DEMO_DAY.open(newline="") as file:
         rows = [row for row in csv.reader(file) if row[1] == "0"][:9]
     grasps = [np.array(row[2:], dtype=np.int64).reshape(3, 24) for row in rows]
@@ -42,7 +42,7 @@ def poses() -> tuple[Counts, list[Counts]]:
 
 
 class Fault:
-    """A fault of the sensors, from now on for a while."""
+    """A fault of the sensors that lasts `ms` from now, or a drawn time; see `FAULTS`."""
 
     def __init__(self, kind: str, world: World, ms: int | None = None) -> None:
         draw = world.random
@@ -70,7 +70,7 @@ class Sensors(FakeDriver):
         self.faults: list[Fault] = []
         self._before: list[Fault] = []
         self.handed_ns = self.since_ns = 0
-        """When a reading was taken, and when the faults changed."""
+        """Times at which a reading was last taken, and the faults last changed, ns."""
         self._counts = self.rest.astype(np.uint16)
         self._seq = 0
         self._angle = 0.0
@@ -88,7 +88,7 @@ class Sensors(FakeDriver):
         self.rest_for(2000)
 
     def rest_for(self, ms: int) -> None:
-        """Open the hand, to be tared."""
+        """Open the hand for at least `ms`, so that its sensors can be tared."""
         self.pose = self.rest
         self._open_until_ns = max(self._open_until_ns, self.world.now_ns + ms * MS)
 
@@ -112,7 +112,7 @@ class Sensors(FakeDriver):
         return arrived
 
     def exchange(self) -> None:
-        """Other sensors, which rest otherwise; some were there before."""
+        """Put in one of three drawn sets of sensors; each rests differently, and may come back."""
         self.number = self.world.random.randrange(1, 4)
         steps = np.random.default_rng(self.number).choice((0, 140), (3, 24))
         self.rest = poses()[0] + steps * (self.number > 1)

@@ -1,6 +1,6 @@
-"""Days of the whole daemon under faults: its promises hold, and it continues when they are over.
+"""Days of the whole daemon under faults: its promises hold, and it works when they are over.
 
-A day of three shifts has a minute. `tests/daemon/run/days.py` says what is checked.
+A day of three shifts is a simulated minute. `tests/daemon/run/days.py` says what is checked.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from tests.daemon.run import days
 
 
 @pytest.mark.parametrize("seed", [3, 4, 5, 6])
-def test_a_day_of_faults_breaks_no_promise(seed: int) -> None:
+def test_the_daemons_promises_hold_on_a_day_of_faults(seed: int) -> None:
     day = days.run(seed)
     assert day.said["stable"] > 0
     assert day.lives > 1
@@ -19,5 +19,5 @@ def test_a_day_of_faults_breaks_no_promise(seed: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(100, 130))
-def test_many_days_of_faults_break_no_promise(seed: int) -> None:
+def test_the_daemons_promises_hold_on_many_days_of_faults(seed: int) -> None:
     days.run(seed)

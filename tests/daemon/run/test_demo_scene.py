@@ -1,4 +1,4 @@
-"""The scene of the demo earns its solid `stable` by outcomes that its recording tells."""
+"""The demo's verdict `stable` is in doubt until outcomes in its recording support it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from graspd.drivers.twins.grasps.whole_grasps import PALM_RATE_HZ
 
 SCENE = Path(__file__).parents[3] / "deploy" / "scenes" / "demo.toml"
 LOOPS = 2
-"""Times that the recording is played: less than two minutes."""
+"""Number of times that the recording is played, together less than two minutes."""
 
 
 class Heard(RunLog):
@@ -34,7 +34,7 @@ class Heard(RunLog):
         self.verdicts.append(published.verdict)
 
 
-def test_the_demo_turns_solid_green_within_two_minutes(
+def test_the_demos_stable_is_supported_by_outcomes_within_two_minutes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recordings = ", ".join([f'"{SHOW_RECORDING}"'] * LOOPS)

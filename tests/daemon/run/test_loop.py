@@ -55,7 +55,7 @@ def test_every_reading_gets_one_verdict_in_order() -> None:
 
 
 class ScriptedDriver(FakeDriver):
-    """Moves the clock at every look, and delivers at set times only."""
+    """Driver that moves the clock by 1 ms at each read, and has a reading at each of `times_ms`."""
 
     def __init__(self, times_ms: list[int], clock: Clock, end_ms: int) -> None:
         super().__init__([], clock)
@@ -78,7 +78,7 @@ class ScriptedDriver(FakeDriver):
         return []
 
 
-def test_silence_is_reported_once_per_limit() -> None:
+def test_silence_is_reported_once_per_age_limit() -> None:
     clock = Clock()
     start_ns = clock()
     bench = LoopBench(ScriptedDriver([10, 400], clock, 450), clock)
@@ -95,7 +95,7 @@ def test_silence_is_reported_once_per_limit() -> None:
     assert [verdict.valid for verdict in bench.verdicts] == [True, False, False, False, True]
 
 
-def test_a_slow_driver_may_miss_ten_periods() -> None:
+def test_silence_of_a_slow_driver_is_reported_after_ten_periods() -> None:
     clock = Clock()
     start_ns = clock()
     driver = ScriptedDriver([10, 400], clock, 1000)
@@ -130,7 +130,7 @@ def test_latency_includes_the_wait_behind_other_readings() -> None:
 
 
 @pytest.mark.parametrize("error", [LinkError(LinkCause.UNKNOWN, "gone"), DriverError("broken")])
-def test_a_driver_that_gives_up_ends_the_loop(error: DriverError) -> None:
+def test_a_driver_error_ends_the_loop_with_status_stopping(error: DriverError) -> None:
     """The last status is sent; the watchdog is not fed for the round that failed."""
     clock, watchdog = Clock(), Watchdog()
     driver = FakeDriver([reading(clock(), 1), reading(clock(), 2), error], clock)
@@ -141,7 +141,7 @@ def test_a_driver_that_gives_up_ends_the_loop(error: DriverError) -> None:
     assert watchdog.fed == 2
 
 
-def test_what_had_come_before_the_signal_is_still_judged() -> None:
+def test_a_reading_that_came_before_the_signal_is_judged() -> None:
     """A reading and the signal arrive while the loop sleeps: the reading is not lost."""
     clock = Clock()
     bytes_there, write = os.pipe()
@@ -168,7 +168,7 @@ def test_what_had_come_before_the_signal_is_still_judged() -> None:
 
 
 class Watchdog(Companion):
-    """Counts how often it is fed."""
+    """Counts the rounds, in each of which a watchdog would be fed."""
 
     def __init__(self) -> None:
         self.fed = 0
@@ -201,7 +201,7 @@ def test_a_reading_is_sent_only_while_there_is_a_subscriber() -> None:
 
 
 class Peer(Companion):
-    """Asks and tells an outcome before every wait, and keeps what it hears of that."""
+    """Asks and reports an outcome before every wait; keeps the answers and all that follows."""
 
     def __init__(self, boot_id: str) -> None:
         self.boot_id = boot_id
@@ -226,7 +226,7 @@ class Peer(Companion):
         return {"peer": {"outcomes": self.refused.count(KEPT)}}
 
 
-def test_a_companion_asks_tells_and_hears_answers() -> None:
+def test_a_companion_asks_reports_outcomes_and_gets_the_answers() -> None:
     clock = Clock()
     driver = FakeDriver([reading(clock(), seed) for seed in (1, 2)], clock)
     peer = Peer("b" * 32)
@@ -244,13 +244,13 @@ BOOT = "b" * 32
 
 
 def told(bench: LoopBench, outcome: Literal["stable", "slip"]) -> list[Reply]:
-    """What the answers to an outcome of the first grasp are, as they come."""
+    """Report an outcome of the first grasp; return a list to which its answers are added."""
     answers: list[Reply] = []
     bench.loop.outcome(Report(GraspId(BOOT, 1), outcome), answers.append)
     return answers
 
 
-def test_a_kept_outcome_is_answered_and_then_repeated() -> None:
+def test_outcomes_are_answered_once_saved_and_then_as_repeated() -> None:
     clock, waiting = Clock(), list[Answer]()
     driver = FakeDriver([reading(clock())], clock)
     bench = LoopBench(driver, clock, boot_id=BOOT, keep=waiting.append)
@@ -268,8 +268,8 @@ def test_a_kept_outcome_is_answered_and_then_repeated() -> None:
     assert [topic for topic, _ in bench.output.sent].count(b"outcome.right") == 1
 
 
-def test_a_replay_takes_outcomes_by_its_own_start() -> None:
-    """It enters its grasps in the book by the start that was recorded."""
+def test_a_replay_takes_outcomes_that_name_its_own_start() -> None:
+    """The book of lifts has the grasp under the recorded start's id, but is told the replay's."""
     clock = Clock()
     bench = LoopBench(FakeDriver([reading(clock())], clock), clock, boot_id=BOOT)
     bench.pipeline.boot_id = "e" * 32
@@ -301,7 +301,7 @@ def test_an_outcome_teaches_before_the_next_verdict() -> None:
     assert 0.0 < status.learner.uncertainty < 1.0
 
 
-def test_an_outcome_of_an_earlier_start_waits_until_known() -> None:
+def test_outcomes_of_an_earlier_start_count_only_for_known_grasps() -> None:
     clock, earlier = Clock(), GraspId("e" * 32, 1)
     known = Trust("fake", 0)
     known.note(earlier, known.judge(earlier, 0.1, -2.0, np.empty(0)), stable=True)
@@ -317,7 +317,7 @@ def test_an_outcome_of_an_earlier_start_waits_until_known() -> None:
 
 
 class Exchanging(FakeDriver):
-    """Whose sensor is another one from the third reading on."""
+    """Driver whose sensor has another serial number from the third reading on."""
 
     @property
     def serials(self) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""Readings that come faster than they are judged: the newest counts, the others are counted."""
+"""Readings that come faster than they are judged: the newest is judged, the others counted."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SECOND_NS = 1_000_000_000
 
 
 class LiveDriver(FakeDriver):
-    """Hands over what has come by now, `at_once` readings at most."""
+    """Live driver that returns the readings made by now, `at_once` at most per call."""
 
     live = True
 
@@ -50,7 +50,7 @@ class LiveDriver(FakeDriver):
 
 
 class OverloadedLoop(LoopBench):
-    """A loop whose verdicts cost time, run to its end."""
+    """A loop in which each verdict takes `cost_ns()`; it has run to its end."""
 
     def __init__(
         self,
@@ -84,7 +84,7 @@ def flood(cost_ns: int, seconds: float = 3.0, at_once: int = 1000) -> Overloaded
 
 
 @pytest.mark.parametrize("times", [1.5, 10.0])
-def test_an_overload_judges_the_newest_and_counts_all(times: float) -> None:
+def test_in_overload_the_newest_are_judged_and_all_are_counted(times: float) -> None:
     cost_ns = round(times * PERIOD_NS)
     bench = flood(cost_ns, 4.0)
     status = bench.statuses[-1]
@@ -108,7 +108,7 @@ def test_an_overload_judges_the_newest_and_counts_all(times: float) -> None:
     [[PERIOD_NS * 9 // 10] * 101, [0] * 20 + [95 * MS] + [MS // 2] * 80],
     ids=["nearly a period each", "one stall"],
 )
-def test_what_can_be_judged_in_time_is_judged_whole(costs: list[int]) -> None:
+def test_no_reading_is_skipped_if_all_are_judged_in_time(costs: list[int]) -> None:
     clock, each = Clock(), iter(costs)
     bench = OverloadedLoop(LiveDriver(stream(1.0), clock), clock, lambda: next(each))
     assert [seen.seq for _, seen in bench.judged] == list(range(100))
@@ -117,7 +117,7 @@ def test_what_can_be_judged_in_time_is_judged_whole(costs: list[int]) -> None:
     assert sum(bench.rests_s) < 0.01  # a stall alone is long enough for one
 
 
-def test_a_recording_is_judged_row_by_row() -> None:
+def test_a_recording_is_judged_whole_however_slow_the_judge() -> None:
     clock = Clock()
     driver = LiveDriver(stream(1.0), clock)
     driver.live = False
@@ -158,7 +158,9 @@ def test_an_overload_is_logged_at_its_begin_and_end(
     assert f"{bench.statuses[-1].skipped_readings} readings" in caplog.text
 
 
-def test_a_single_stall_is_counted_and_no_overload(caplog: pytest.LogCaptureFixture) -> None:
+def test_readings_skipped_in_one_stall_are_counted_without_overload(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     clock = Clock()
     costs = itertools.chain([MS] * 20, [SECOND_NS // 2], itertools.repeat(MS))
     bench = OverloadedLoop(LiveDriver(stream(3.0), clock), clock, lambda: next(costs))
@@ -167,7 +169,7 @@ def test_a_single_stall_is_counted_and_no_overload(caplog: pytest.LogCaptureFixt
     assert not caplog.records
 
 
-def test_joints_are_all_followed_in_their_order() -> None:
+def test_in_overload_no_joint_reading_is_skipped_or_reordered() -> None:
     clock = Clock()
     angles = [
         JointReading(item.t_ns, number, ("FFJ3",), np.array([0.5]))
@@ -179,8 +181,8 @@ def test_joints_are_all_followed_in_their_order() -> None:
     assert bench.statuses[-1].skipped_readings > 100
 
 
-def test_the_newest_is_that_of_all_that_the_driver_has() -> None:
-    """The driver may hand over a few readings at a time."""
+def test_the_newest_is_judged_even_if_reads_return_only_three() -> None:
+    """The loop reads again until no reading waits."""
     bench = flood(100 * MS, 3.0, at_once=3)
     ages_ms = [verdict.age_ms for verdict, _ in bench.judged[3:-1]]
     assert max(ages_ms) < 10.0
@@ -197,7 +199,7 @@ def test_a_driver_with_endless_readings_does_not_hold_the_loop() -> None:
 
 
 def test_a_sensor_frozen_among_skipped_readings_is_never_stable() -> None:
-    """Each reading is a grasp: the judge sees but the newest, and that differs from its last."""
+    """The judge sees only the newest reading, which differs from the one that it saw before."""
     clock = Clock()
     came = stream(2.0)
     for at in range(100, 200, 10):
@@ -232,7 +234,7 @@ def test_an_unchanged_finger_is_marked_held_except_its_flagged_electrodes() -> N
     assert found.faults[0, 5] == ElectrodeFault.PARITY
 
 
-def test_an_unread_finger_is_missing_not_held() -> None:
+def test_an_unread_finger_stays_marked_missing_not_held() -> None:
     former, newest = reading(START_NS, 1, 1), reading(START_NS + PERIOD_NS, 2, 2)
     counts, faults = newest.counts.copy(), np.zeros((3, 24), np.uint8)
     counts[2], faults[2] = 0, ElectrodeFault.MISSING
@@ -245,7 +247,7 @@ def test_an_unread_finger_is_missing_not_held() -> None:
 
 
 class BusySelector(selectors.SelectSelector):
-    """What is ready is found after a while: a processor so slow that asking takes 0.2 ms."""
+    """Selector that never waits but works for 0.2 ms, as on a slow processor."""
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         until_ns = time.thread_time_ns() + 200_000
@@ -254,7 +256,7 @@ class BusySelector(selectors.SelectSelector):
         return super().select(0.0)
 
 
-def test_a_slow_busy_processor_rests_too() -> None:
+def test_a_loop_that_only_works_in_its_selector_rests() -> None:
     rests_s: list[float] = []
     clock = Clock()
     driver = FakeDriver([], clock)
@@ -271,7 +273,7 @@ def test_a_slow_busy_processor_rests_too() -> None:
     assert 0.0 < rests_s[0] <= YIELD_MAX_NS / 1e9
 
 
-def test_a_reading_that_does_not_follow_unsettles_the_grasp() -> None:
+def test_a_reading_marked_interrupted_makes_the_grasp_settle_again() -> None:
     """The counts continue as before; only the sender says that it began again."""
     clock, random = Clock(), np.random.default_rng(3)
     came: list[Reading] = []

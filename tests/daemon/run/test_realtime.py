@@ -1,4 +1,4 @@
-"""Realtime: taken where it may be had, one warning where not, given back at the end."""
+"""Realtime mode: set where the system allows it, else one warning; undone at the end."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def as_before() -> Iterator[None]:
 
 
 def in_a_process(text: str, folder: Path) -> str:
-    """What a process of its own prints, which may give up rights that never come back."""
+    """Return the output of `text`, run in another process, which may give up rights for good."""
     return subprocess.run(
         [sys.executable, "-c", WORLD + text],
         cwd=Path(__file__).parents[3],
@@ -56,7 +56,7 @@ def in_a_process(text: str, folder: Path) -> str:
 
 
 def fifo_may_be_had() -> bool:
-    """Some containers refuse it even to root."""
+    """Return True if SCHED_FIFO is allowed; some containers refuse it even to root."""
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
     except OSError:
@@ -65,7 +65,7 @@ def fifo_may_be_had() -> bool:
     return True
 
 
-def test_the_loops_thread_gets_priority_and_all_get_the_processor(as_before: None) -> None:
+def test_only_the_loops_thread_gets_priority_all_are_pinned(as_before: None) -> None:
     if not fifo_may_be_had():
         pytest.skip("SCHED_FIFO is refused here")
     processor = max(os.sched_getaffinity(0))
@@ -100,7 +100,7 @@ with RealtimeMode(Realtime(priority=None)) as mode:
     assert locked_kib > 0
 
 
-def test_a_processor_that_is_not_there_is_named(
+def test_an_absent_processor_is_named_in_the_warning(
     as_before: None, caplog: pytest.LogCaptureFixture
 ) -> None:
     with RealtimeMode(Realtime(priority=None, cpus=(1000,))) as mode:
@@ -131,7 +131,7 @@ print("lives on")
     assert end == "lives on"
 
 
-def test_tidying_collects_what_the_stopped_collector_would_have(as_before: None) -> None:
+def test_in_realtime_mode_garbage_is_collected_at_each_status(as_before: None) -> None:
     collected = []
 
     class Loop:

@@ -1,4 +1,4 @@
-"""What goes along with a replay."""
+"""The controller of a replay, which reports the recorded outcomes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.kit.messages import GOLDEN_VERDICT
     ("in_the_table", "told"),
     [("mug", "mug"), ('a "red" pen', None), ("=HYPERLINK(0)", None), ("mug\n", None), (None, None)],
 )
-def test_an_object_has_a_name_that_outcomes_take(
+def test_only_object_names_that_messages_allow_are_reported(
     in_the_table: str | None, told: str | None
 ) -> None:
     controller, requests = Controller(only_lifted=False), Asked()

@@ -39,7 +39,7 @@ endpoint = "ipc://{folder}/v"
 
 
 class Running:
-    """A daemon, who it tells how it goes, and a subscriber."""
+    """A daemon, the service manager that it reports to, and a subscriber."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -66,14 +66,14 @@ class Running:
                     self.process.kill()
 
     def told(self, line: str) -> list[str]:
-        """The message to the manager that has a line that begins so; others are passed over."""
+        """Return the lines of the next message to the manager in which one begins with `line`."""
         while True:
             message = self.ears.recv(4096).decode().split("\n")
             if any(text.startswith(line) for text in message):
                 return message
 
     def verdict(self, like: Callable[[Verdict], bool] = lambda _verdict: True) -> Verdict:
-        """Wait for a verdict for which `like` is true."""
+        """Wait for a verdict for which `like` is true, and return it."""
         deadline_s = time.monotonic() + PATIENCE_S
         while time.monotonic() < deadline_s and self.subscriber.poll(int(PATIENCE_S * 1e3)):
             topic, payload = self.subscriber.recv_multipart()
@@ -82,7 +82,7 @@ class Running:
         pytest.fail("no such verdict")
 
     def stops(self) -> bool:
-        """Wait for the status that says so."""
+        """Wait for a status of the state `stopping`; return False if none comes."""
         while self.subscriber.poll(int(PATIENCE_S * 1e3)):
             topic, payload = self.subscriber.recv_multipart()
             if topic == b"status.right" and decode_status(payload).state is State.STOPPING:
@@ -122,7 +122,7 @@ def test_a_signal_ends_the_daemon_and_is_logged(running: Running, number: signal
     assert running.stops()
 
 
-def test_an_ended_table_logs_a_judgement_a_row(
+def test_the_log_counts_one_judgement_per_row_of_a_table(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     rows = len(DEMO_TABLE.read_text().splitlines()) - 1

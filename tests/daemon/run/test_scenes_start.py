@@ -1,4 +1,4 @@
-"""What `check` calls fine must start: drawn from the scene's own classes, up to the open link."""
+"""Drawn scenes in which `check` finds no error start, up to the open link."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ SCHEMA = Scene.model_json_schema()
 
 
 def values(schema: dict[str, Any]) -> st.SearchStrategy[Any]:
-    """Values that a schema allows, as TOML has them; some are refused all the same."""
+    """Return a strategy for values that a schema allows; the scene may still refuse some."""
     if "$ref" in schema:
         return sections(SCHEMA["$defs"][schema["$ref"].rpartition("/")[2]])
     if choices := schema.get("anyOf", schema.get("oneOf")):
@@ -107,14 +107,14 @@ def sections(draw: st.DrawFn, schema: dict[str, Any]) -> dict[str, Any]:
 
 
 def as_toml(value: object) -> str:
-    """One value; a section is an inline table."""
+    """Return a value as TOML; a section is an inline table."""
     if isinstance(value, dict):
         return "{" + ", ".join(f"{key} = {as_toml(each)}" for key, each in value.items()) + "}"
     return json.dumps(value)
 
 
 def start(path: Path) -> None:
-    """Do what `run` does up to an open link; a link that is not there is not its fault."""
+    """Start a scene as `run` does, up to the open link; ignore links that cannot be opened."""
     parts = prepare(path)
     with ExitStack() as stack:
         around = Assembly(parts, stack)
@@ -131,7 +131,7 @@ def start(path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, int]]:
-    """A folder with what scenes name, and a free port. No service makes folders here."""
+    """A folder with what drawn scenes name, and a free port; a missing folder is an error."""
     folder = tmp_path_factory.mktemp("s")
     (folder / "folder").mkdir()
     make(folder / "keys", "daemon")
@@ -151,7 +151,9 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, int]
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )
 @given(drawn=sections(SCHEMA))
-def test_what_check_calls_fine_starts(place: tuple[Path, int], drawn: dict[str, Any]) -> None:
+def test_a_scene_in_which_check_finds_no_error_starts(
+    place: tuple[Path, int], drawn: dict[str, Any]
+) -> None:
     folder, port = place
     drawn["publish"] = {"endpoint": "ipc://F/a", **drawn.get("publish", {})}
     text = "\n".join(f"{name} = {as_toml(section)}" for name, section in drawn.items())

@@ -1,4 +1,4 @@
-"""A computer that sleeps stops the monotonic clock: nothing of before it counts afterwards."""
+"""After a sleep, which stops the monotonic clock, no earlier reading gives a verdict."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ HOUR_NS = 3600 * 1000 * MS
 
 
 class Sleeper(FakeModel):
-    """While it judges for the third time, the computer sleeps."""
+    """Model during whose third run the computer sleeps."""
 
     def __init__(self, boot: Clock) -> None:
         super().__init__()
@@ -27,7 +27,7 @@ class Sleeper(FakeModel):
         return super().run()
 
 
-def test_a_reading_from_before_a_sleep_gives_no_verdict() -> None:
+def test_a_sleep_while_judging_makes_the_last_verdict_unknown() -> None:
     clock, boot = Clock(), Clock()
     driver = FakeDriver([reading(clock(), seed) for seed in range(9)], clock)
     bench = LoopBench(driver, clock, model=Sleeper(boot), sleep=Sleep(clock, boot))
@@ -38,7 +38,7 @@ def test_a_reading_from_before_a_sleep_gives_no_verdict() -> None:
     assert bench.statuses[-1].state is State.STOPPING
 
 
-def test_a_late_client_after_a_sleep_hears_nothing_old() -> None:
+def test_a_sleep_before_the_first_reading_gives_only_unknown() -> None:
     clock, boot = Clock(), Clock()
     sleep = Sleep(clock, boot)
     boot.now_ns += HOUR_NS
@@ -48,7 +48,7 @@ def test_a_late_client_after_a_sleep_hears_nothing_old() -> None:
 
 
 @pytest.mark.parametrize(("apart_ms", "slept"), [(0, False), (49, False), (-90, False), (51, True)])
-def test_a_sleep_is_when_the_clocks_move_apart(apart_ms: int, slept: bool) -> None:
+def test_a_sleep_is_detected_by_clocks_over_50_ms_apart(apart_ms: int, slept: bool) -> None:
     clock, boot = Clock(), Clock(7 * HOUR_NS)
     sleep = Sleep(clock, boot)
     clock.now_ns += HOUR_NS

@@ -1,4 +1,4 @@
-"""What systemd hears, as sd_notify(3) and sd_watchdog_enabled(3) have it."""
+"""Messages to systemd, as sd_notify(3) and sd_watchdog_enabled(3) specify them."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def heard(ears: socket.socket) -> list[str]:
     return ears.recv(4096).decode().split("\n")
 
 
-def test_ready_comes_with_a_status(ears: socket.socket, systemd: Systemd) -> None:
+def test_the_ready_message_also_has_a_status_text(ears: socket.socket, systemd: Systemd) -> None:
     systemd.ready("ready: spi, cnn1")
     assert heard(ears) == ["READY=1", "STATUS=ready: spi, cnn1"]
 
@@ -63,7 +63,7 @@ def test_the_watchdog_is_fed_four_times_within_its_timeout(ears: socket.socket) 
     manager.close()
 
 
-def test_without_a_watchdog_nothing_is_fed(ears: socket.socket) -> None:
+def test_without_a_watchdog_no_keep_alive_is_sent(ears: socket.socket) -> None:
     manager = Systemd(ears.getsockname())
     manager.after_round()
     manager.stopping()
@@ -83,7 +83,7 @@ def test_without_a_watchdog_nothing_is_fed(ears: socket.socket) -> None:
         ({"WATCHDOG_USEC": "soon"}, False),
     ],
 )
-def test_only_a_sound_watchdog_of_this_process_counts(
+def test_only_a_valid_watchdog_timeout_for_this_process_counts(
     environment: dict[str, str], watched: bool
 ) -> None:
     manager = Systemd.of({"NOTIFY_SOCKET": "/nowhere", **environment})
@@ -93,11 +93,11 @@ def test_only_a_sound_watchdog_of_this_process_counts(
 
 
 @pytest.mark.parametrize("address", ["", "relative", "vsock:2:1234"])
-def test_an_address_of_another_kind_is_not_a_manager(address: str) -> None:
+def test_an_unsupported_notify_address_means_no_manager(address: str) -> None:
     assert Systemd.of({"NOTIFY_SOCKET": address}) is None
 
 
-def test_an_abstract_socket_is_found() -> None:
+def test_messages_reach_a_manager_at_an_abstract_socket() -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ears:
         name = f"graspd-test-{os.getpid()}"
         ears.bind(f"\0{name}")
@@ -149,14 +149,16 @@ NOT_TARED = dict.fromkeys(("ff", "mf", "th"), Reason.NOT_TARED)
         ),
     ],
 )
-def test_what_to_do_comes_first_and_what_follows_never(
+def test_the_status_line_names_causes_first_and_no_consequences(
     health: dict[str, Reason], shown: str
 ) -> None:
     line = in_a_line(msgspec.structs.replace(GOLDEN_STATUS, health=health), late=0)
     assert line.endswith(f", gate idle, {shown}")
 
 
-def test_late_readings_of_before_are_not_shown(ears: socket.socket, systemd: Systemd) -> None:
+def test_only_late_readings_since_the_last_status_are_shown(
+    ears: socket.socket, systemd: Systemd
+) -> None:
     for count in (3, 3, 5):
         systemd.on_status(msgspec.structs.replace(GOLDEN_STATUS, late_readings=count))
     late = [re.findall(r"(\d+) late", heard(ears)[0]) for _ in range(3)]

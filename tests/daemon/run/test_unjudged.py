@@ -27,7 +27,7 @@ def every(rows: int) -> Change:
 
 
 def without_thumb(stream: pd.DataFrame) -> pd.DataFrame:
-    """The thumb rests where it is in the first row, with noise of three counts."""
+    """Return `stream` with the thumb at rest, as in the first row, with noise of three counts."""
     thumb = [name for name in stream.columns if name.startswith("th_")]
     noise = np.random.default_rng(1).normal(0.0, 3.0, (len(stream), len(thumb)))
     stream.loc[:, thumb] = (stream[thumb].iloc[0].to_numpy() + noise).round().astype(int)
@@ -72,6 +72,6 @@ def test_a_table_of_broken_sensors_says_why(
     assert f"{len(table)} of {len(table)} readings saturated: electrodes at 0 or 4095" in said
 
 
-def test_what_is_judged_needs_no_word(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_judged_recording_prints_no_explanation(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["replay", str(DEMO_RECORDING)]) == 0
     assert capsys.readouterr().err == ""
