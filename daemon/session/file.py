@@ -1,4 +1,4 @@
-"""The file of one kept session: complete, with a checksum, or refused."""
+"""The file of one kept session, with a checksum; an incomplete or damaged one is refused."""
 
 from __future__ import annotations
 

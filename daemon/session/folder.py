@@ -1,4 +1,4 @@
-"""The kept sessions of a hand: a folder with a file for each set of fingers, model and sensors."""
+"""The kept sessions of a hand: a folder with a file per combination of fingers, model, sensors."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ DAMAGED_MAX: Final = 16
 LOCK: Final = "lock"
 """Name of the file that is locked."""
 ENDING: Final = ".session"
-"""Ending of a session file's name, which is a number and this."""
+"""Ending of a session file's name, after its number."""
 NUMBER: Final = re.compile(r"[1-9][0-9]{0,8}")
-"""Pattern of that number; files with other names do not belong to graspd."""
+"""Pattern of a session file's number; files with other names do not belong to graspd."""
 
 Found = dict[int, KeptSession | SessionFileError]
 """Content of each file, or the error in reading it, by file number, the last used first."""
 
 
 class SessionFolder:
-    """One hand's folder, locked while it is open. Only files that were saved here are replaced.
+    """One hand's folder, locked while it is open. Only files that it loaded or saved are replaced.
 
     The files are numbered in the order in which their sessions were last used.
     """
@@ -149,7 +149,7 @@ class SessionFolder:
         return bool(numbers)
 
     def _lock_late(self) -> None:
-        """Lock the loaded folder. Raises `SessionFileError` if its files have changed since."""
+        """Lock the loaded folder. Raises `SessionFileError` if it is in use or has changed."""
         loaded = self._kept, self._damaged
         self.lock()
         try:

@@ -42,7 +42,7 @@ WAIT_S: Final = 0.4
 SAVE_PERIOD_NS: Final = 10_000_000_000
 """Time between two saves, ns, while no outcome waits."""
 WAITING_MAX: Final = 64
-"""Most answers that wait for the disk; a new one replaces the oldest."""
+"""Most answers that wait for the disk. With one more, the oldest is given as `busy`."""
 BUSY: Final = Reply(Told.BUSY, "too many wait for the disk, tell it again")
 HANGS: Final = Reply(Told.NOT_KEPT, "the disk does not answer")
 UNEXPECTED: Final = "it could not be written"
@@ -275,7 +275,7 @@ class SessionKeeper(SensorWatch):
         return True
 
     def _budget_of(self, former: TrustState) -> float | None:
-        """Return the kept budget of slips; None if it was kept under another configured risk."""
+        """Return the kept budget of slips; None without learning, or if the risk limit differs."""
         if self._trust is None:
             return None
         is_same = former.risk.max_slip_when_stable == self._trust.risk.limits.max_slip_when_stable
@@ -286,9 +286,9 @@ class Continued(NamedTuple):
     """Kept sessions that a start of the daemon continues."""
 
     used: KeptSession | None
-    """Session of these fingers; None: not kept."""
+    """Session whose calibration continues; None: no kept one fits."""
     learned: KeptSession | None
-    """Session that holds this model's learning with the same sensors; None: not kept."""
+    """Session whose learning, by this model with the same sensors, continues; None: no such one."""
     problems: list[str]
     """Why other sessions are not continued."""
 
@@ -309,8 +309,8 @@ def continue_kept(
 def _continues(
     pipeline: Pipeline, fingers: Sequence[str], kept: KeptSession, problems: list[str]
 ) -> bool:
-    """Restore a session; return False if it is of other fingers or may be of other sensors. The
-    reason is added to `problems`."""
+    """Restore a session; return False if it is of other fingers, does not fit the model, or may be
+    of other sensors. Adds the reason to `problems`, unless the model has no session."""
     try:
         of_fingers(kept, fingers)
         if pipeline.session is None:
@@ -355,7 +355,7 @@ def _taught_with(
 
 
 def is_of_unknown_sensors(kept: KeptSession) -> bool:
-    """Return True if a session was seeded from grasps without rest or serials of the sensors."""
+    """Return True for a session seeded from recorded grasps: it has no rest and no serials."""
     return kept.statistics is not None and kept.rest is None and not numbers(kept.serials)
 
 

@@ -149,7 +149,10 @@ def moved_fingers(before: Rest, now: Rest) -> list[int]:
 
 
 def fits(seeded: SessionState, seen: SessionState, fingers: int) -> bool:
-    """Return True if the grasps of a young session look like those of a seeded one."""
+    """Return True if the grasps of a young session look like those of a seeded one.
+
+    `fingers`: their number.
+    """
     if len(seeded.mean) != len(seen.mean) or not seeded.weight:
         return False
     spread = np.sqrt(np.array(seeded.squares) / seeded.weight)

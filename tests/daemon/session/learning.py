@@ -1,4 +1,4 @@
-"""A session and what learns in it, small, with synthetic grasps."""
+"""Small sessions and learners with synthetic grasps, and stand-ins for what is around them."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ SHARPNESS = (Sharpness(0.0, 3.0), Sharpness(5.0, 2.0), Sharpness(20.0, 1.0))
 BOOT = "0123456789abcdef" * 2
 INPUTS = 78
 NOBODY = cast(Requests, None)
-"""Stands in for requests that are never made."""
+"""Placeholder for the loop's `Requests` where no request is made."""
 SHORT = Durations(
     approach_s=(0.3, 0.3),
     settle_s=(0.5, 0.6),
@@ -43,7 +43,7 @@ SHORT = Durations(
     release_s=(0.2, 0.2),
     rest_s=(0.4, 0.5),
 )
-"""Grasps of two seconds."""
+"""Durations that make a grasp about two seconds long."""
 
 
 def counts(number: int, seed: int = 0) -> NDArray[np.uint16]:
@@ -65,7 +65,7 @@ def trust(model: str = "model", inputs: int = INPUTS) -> Trust:
 
 
 def judge(part: Trust, grasp: int, boot: str = BOOT) -> None:
-    """Judge and note a grasp; about half are likely to hold."""
+    """Have `part` judge and note a grasp, drawn by its number; about half are likely to hold."""
     draw = np.random.default_rng(grasp)
     inputs = np.clip(draw.normal(0.0, 1.0, part.learner.inputs), -3.0, 3.0).astype(np.float32)
     margin = float(draw.normal(0.0, 4.0))
@@ -76,7 +76,7 @@ def judge(part: Trust, grasp: int, boot: str = BOOT) -> None:
 
 
 def tell(part: Trust, grasp: int, boot: str = BOOT) -> OutcomeStatus:
-    """Its outcome, always the same."""
+    """Report the outcome of a grasp: a slip if its number is a multiple of 3."""
     return part.outcome(GraspId(boot, grasp), slipped=grasp % 3 == 0)
 
 
@@ -90,7 +90,7 @@ def last_kept(folder: Path) -> KeptSession | None:
 
 
 class SensorDriver(FakeDriver):
-    """A driver that knows its sensors."""
+    """A driver whose serial numbers the test sets."""
 
     known: dict[str, str] = {}  # noqa: RUF012 - set by the test
 
@@ -121,13 +121,13 @@ def go_round(keeper: SessionKeeper) -> None:
 
 
 def sealed(plain: bytes) -> bytes:
-    """A file with this content and a right checksum."""
+    """Return the bytes of a session file with this content and a right checksum."""
     content = zlib.compress(plain)
     return hashlib.sha256(content).digest() + content
 
 
 class FakeJudge:
-    """What is asked of a pipeline where sensors are watched: at an exchange it forgets."""
+    """Stands for the pipeline of a `SensorWatch`; at an exchange it forgets the sensors."""
 
     def __init__(
         self,
@@ -136,7 +136,7 @@ class FakeJudge:
         read_rest: Callable[[], NDArray[np.float64]] | None = None,
         hear: Callable[[], object] = list,
     ) -> None:
-        """`hear`: called at each exchange."""
+        """`part`: what learns. `hear`: called at each exchange."""
         self.session, self.trust, self.read_rest, self.hear = session, part, read_rest, hear
 
     def sensors_exchanged(self, known: Exchanged = NOTHING_KNOWN) -> None:

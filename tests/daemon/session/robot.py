@@ -1,4 +1,4 @@
-"""A hand with its daemon's judge and session, and published days to play to it."""
+"""A hand with its daemon's judge and session, and the published days to replay to it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tests.daemon.session.learning import (
 )
 
 OUTAGE_NS = 2_000_000_000
-"""Longer than the second after which tares are forgotten."""
+"""Duration of an outage, ns: longer than the second after which tares are forgotten."""
 
 
 class Robot:
@@ -62,7 +62,7 @@ class Robot:
         self.clock.now_ns += OUTAGE_NS
 
     def see(self, grasps: WholeGrasps) -> Iterator[tuple[bool | None, Decision, bool]]:
-        """Yield of each grasp whether it slips, its first verdict, and if it was calibrated."""
+        """Yield for each grasp if it slips, its first decision, and if it is calibrated."""
         judged = 0
         begin_ns = self.clock.now_ns
         for row in grasps:
@@ -79,7 +79,7 @@ class Robot:
 
 
 class Day:
-    """Grasps of one published day, resting where the upper tail of its counts is."""
+    """Grasps of one published day; the rest is estimated from the upper tail of the counts."""
 
     def __init__(self, name: str, folder: Path) -> None:
         path = folder / f"{name}.csv"
@@ -88,13 +88,13 @@ class Day:
         self._order = np.random.default_rng(0).permutation(len(self.grasps))
 
     def stream(self, start: int, number: int) -> WholeGrasps:
-        """`number` grasps from place `start` of a fixed random order, with noise and rests."""
+        """Return `number` grasps from `start` on of a fixed random order, with noise and rests."""
         chosen = self._order[start : start + number].tolist()
         ends = [EndPoint(self.grasps[row], bool(self.slipped[row]), "object") for row in chosen]
         return WholeGrasps(rest_above(self.grasps), ends, rate_hz=RATE_HZ, durations=SHORT)
 
     def teach(self, session: SessionCalibration | None, number: int) -> None:
-        """Let a session take in grasps of the end of the order."""
+        """Let a session take in the last `number` grasps of the order that `stream` uses."""
         assert session is not None
         for row in self._order[-number:].tolist():
             session.observe(self.grasps[row])

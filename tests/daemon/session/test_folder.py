@@ -1,4 +1,4 @@
-"""The folder of sessions: whole whenever it is cut off, and damage found."""
+"""The folder of sessions: whole after a kill at any time, and damage is detected."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ from tests.daemon.session.learning import (
 STEPS = ("open", "chmod", "fsync", "replace", "unlink")
 """Functions of `os` by which a file is written; a kill comes before or after a call of one."""
 CALLS = 6
-"""Number of such calls in a save: three of the part, the replacement, the folder's two."""
+"""Number of calls of `STEPS` in a save: three for the new file, its renaming, two to sync."""
 CALLS_OF_TWO = 2 * CALLS + 1
-"""Number of such calls in the first save of two sessions: then the former file goes."""
+"""Number of calls of `STEPS` in a save of two sessions that also removes the former file."""
 
 
 class Killed(BaseException):
@@ -47,7 +47,7 @@ class Killed(BaseException):
 
 @contextmanager
 def killed(call: int, *, after: bool) -> Iterator[None]:
-    """Kill what runs inside, before or after its `call`-th call of a step."""
+    """Raise `Killed` in the block, before or after its call number `call` (from 0) of `STEPS`."""
     left = itertools.count(-call)
 
     def deadly(real: Callable[..., object]) -> Callable[..., object]:
@@ -71,7 +71,7 @@ def killed(call: int, *, after: bool) -> Iterator[None]:
 
 
 def state(grasps: int) -> SessionState:
-    """Statistics that can be told from all others."""
+    """Return statistics of this number of grasps; other numbers give other means."""
     return SessionState(float(grasps), grasps, (float(grasps),), (1.0,))
 
 
@@ -84,7 +84,7 @@ def kept_grasps(path: Path) -> list[int]:
 
 
 def test_a_kill_at_any_step_loses_no_session(tmp_path: Path) -> None:
-    """Sensors are exchanged after a start: their session is saved, and the new one."""
+    """The save that is killed writes two sessions, as when sensors are exchanged after a start."""
     found = set()
     for call, after in itertools.product(range(CALLS_OF_TWO + 1), (False, True)):
         path = tmp_path / f"{call}{after}"
@@ -118,8 +118,8 @@ def test_starts_without_a_grasp_evict_no_session(tmp_path: Path) -> None:
     assert kept_grasps(tmp_path) == [6, 5, 4, 3, 2]
 
 
-def test_a_count_of_the_risk_is_not_an_empty_session() -> None:
-    """Without learning an outcome moves nothing else."""
+def test_a_session_with_only_risk_counts_is_not_empty() -> None:
+    """Without learning an outcome changes only the counts of the risk."""
     part = Trust("model", INPUTS, RiskLimits(0.1), learns=False)
     assert KeptSession(None, FINGERS, {}, part.state()).is_empty
     judge(part, 1)
@@ -130,7 +130,7 @@ def test_a_count_of_the_risk_is_not_an_empty_session() -> None:
 
 @given(st.integers(0, 1 << 20), st.integers(0, 255), st.sampled_from(("byte", "cut", "insert")))
 @settings(max_examples=300, deadline=None)
-def test_a_damaged_file_becomes_no_other_state(place: int, value: int, kind: str) -> None:
+def test_a_file_damaged_at_any_place_is_refused(place: int, value: int, kind: str) -> None:
     with TemporaryDirectory() as name:
         with SessionFolder(Path(name)) as folder:
             folder.save([KeptSession(state(2), FINGERS, {"ff": "A"}, trust().state())])
@@ -161,14 +161,16 @@ def test_a_damaged_file_becomes_no_other_state(place: int, value: int, kind: str
     ],
     ids=["nested", "huge", "former", "no session", "other learning"],
 )
-def test_a_sealed_file_of_another_content_is_refused(tmp_path: Path, spoiled: bytes) -> None:
+def test_a_file_with_right_checksum_but_wrong_content_is_refused(
+    tmp_path: Path, spoiled: bytes
+) -> None:
     path = tmp_path / "1.session"
     path.write_bytes(spoiled)
     with pytest.raises(SessionFileError, match="not a session"):
         load(path)
 
 
-def test_of_files_that_cannot_be_read_sixteen_stay(tmp_path: Path) -> None:
+def test_only_the_newest_sixteen_unreadable_files_are_kept(tmp_path: Path) -> None:
     for number in range(1, 41):
         (tmp_path / f"{number}.session").write_bytes(b"?")
     with SessionFolder(tmp_path) as folder:
@@ -178,7 +180,7 @@ def test_of_files_that_cannot_be_read_sixteen_stay(tmp_path: Path) -> None:
     assert left == {*range(25, 41), 41}
 
 
-def test_a_file_in_place_of_the_folder_stays(tmp_path: Path) -> None:
+def test_a_file_in_place_of_the_folder_is_refused_unchanged(tmp_path: Path) -> None:
     path = tmp_path / "right"
     path.write_bytes(b"?")
     folder = SessionFolder(path)
@@ -188,7 +190,7 @@ def test_a_file_in_place_of_the_folder_stays(tmp_path: Path) -> None:
     assert path.read_bytes() == b"?"
 
 
-def test_a_disk_without_locks_is_not_in_use(
+def test_a_disk_without_locks_is_not_reported_as_in_use(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def flock(*_: object) -> None:

@@ -1,4 +1,4 @@
-"""What outcomes taught is kept with the session, and who told one is answered when it is."""
+"""What outcomes taught is saved with the session; each outcome is answered once it is saved."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def folder(tmp_path: Path) -> Iterator[SessionFolder]:
 
 @pytest.fixture
 def keeper_of(folder: SessionFolder) -> Iterator[Callable[..., SessionKeeper]]:
-    """Makes keepers, and ends them."""
+    """Yield a function that makes keepers, which end after the test."""
     made: list[SessionKeeper] = []
 
     def make(part: Trust, clock: Clock | None = None) -> SessionKeeper:
@@ -73,7 +73,7 @@ def outcomes(folder: SessionFolder) -> int:
     return 0 if kept is None else kept.learner.outcomes
 
 
-def test_a_disk_that_hangs_holds_up_no_loop(
+def test_a_disk_that_hangs_does_not_hold_up_the_loop(
     folder: SessionFolder, disk: Disk, keeper_of: KeeperOf
 ) -> None:
     part = trust()
@@ -102,7 +102,7 @@ def test_a_disk_that_hangs_holds_up_no_loop(
     assert kept_trust(folder) == part.state()
 
 
-def test_a_disk_that_hangs_does_not_hold_up_the_end(
+def test_a_disk_that_hangs_does_not_hold_up_the_shutdown(
     folder: SessionFolder, disk: Disk, keeper_of: KeeperOf
 ) -> None:
     part: Trust = trust()
@@ -120,7 +120,7 @@ def test_a_disk_that_hangs_does_not_hold_up_the_end(
     assert found[3:] == []
 
 
-def test_a_start_with_other_fingers_destroys_nothing(folder: SessionFolder) -> None:
+def test_a_start_with_other_fingers_keeps_the_former_session(folder: SessionFolder) -> None:
     session, part = calibration(), trust()
     keeper = session_keeper(session, sensors(), folder, part=part)
     observe(session, 30)
@@ -142,10 +142,10 @@ def test_a_start_with_other_fingers_destroys_nothing(folder: SessionFolder) -> N
     assert third.state() == other.state()
 
 
-def test_a_disk_that_fails_at_the_start_is_tried_again(
+def test_a_folder_that_cannot_be_made_is_tried_again(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The disk is full or read-only, or the folder is gone."""
+    """The folder that shall contain it is missing until the second try."""
     gone = tmp_path / "gone"
     folder, part, found = SessionFolder(gone / "right"), trust(), list[Reply]()
     keeper = session_keeper(None, sensors(), folder, part=part)
@@ -166,7 +166,7 @@ def test_a_disk_that_fails_at_the_start_is_tried_again(
 
 
 @pytest.mark.parametrize("writes", [False, True])
-def test_a_file_of_another_graspd_is_never_replaced(tmp_path: Path, writes: bool) -> None:
+def test_a_file_changed_by_another_graspd_is_never_replaced(tmp_path: Path, writes: bool) -> None:
     path, mine, theirs, found = tmp_path / "right", trust(), trust(), list[Reply]()
     with SessionFolder(path) as other:
         other.save([KeptSession(None, FINGERS, {}, theirs.state())])
@@ -190,7 +190,7 @@ def test_a_file_of_another_graspd_is_never_replaced(tmp_path: Path, writes: bool
     assert kept_trust(folder) == (theirs if writes else mine).state()
 
 
-def test_an_unexpected_error_of_the_writer_is_answered(
+def test_an_unexpected_error_of_a_save_is_answered_not_kept(
     folder: SessionFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     part, found = trust(), list[Reply]()
@@ -207,7 +207,7 @@ def test_an_unexpected_error_of_the_writer_is_answered(
     assert found[1:] == [KEPT]
 
 
-def test_state_that_a_run_does_not_use_stays(folder: SessionFolder) -> None:
+def test_kept_state_that_a_run_does_not_use_stays_kept(folder: SessionFolder) -> None:
     session, part = calibration(), trust()
     observe(session, 30)
     judge(part, 1)

@@ -1,4 +1,4 @@
-"""Sessions over many lives: restarts, kills, exchanges, models, a full disk, unreadable files."""
+"""Sessions over many starts: kills, exchanges, models, a full disk, unreadable files."""
 
 from __future__ import annotations
 
@@ -44,12 +44,12 @@ from tests.kit.waiting import wait_until
 
 MODELS, SENSORS = st.sampled_from("ab"), st.sampled_from("AAABBBCDEFG")
 UNREADABLE = st.sampled_from((b"", b"?" * 99, sealed(msgspec.msgpack.encode({"version": 4}))))
-"""Files: empty, damaged, of a newer graspd."""
+"""Contents of unreadable session files: empty, damaged, of a newer graspd."""
 
 
 @dataclass
 class Session:
-    """What is known of some sensors, and what a model learned with them."""
+    """Expected session of a sensor and a model: its numbers of grasps and of outcomes."""
 
     model: str
     sensor: str
@@ -62,7 +62,7 @@ class Session:
 
 
 class Model:
-    """What a user may rely on: which session runs, which others are there, what is on the disk."""
+    """Expected state: the session that runs, the others, and the sessions on the disk."""
 
     def __init__(self) -> None:
         self.running = Session("a", "")
@@ -71,7 +71,7 @@ class Model:
         self.known: list[Session] = []  # what there was at the start, or at the last save
 
     def save(self) -> None:
-        """Five stay, beside an empty one that runs; the empty ones go first."""
+        """Expect a save: five sessions stay, and an empty one that runs; other empty ones go first."""
         now = [copy(each) for each in (self.running, *self.others)]
         if now == self.known:
             return  # nothing is written where nothing is new
@@ -87,9 +87,9 @@ class Model:
         return list(newest.values())
 
     def start(self, model: str, *, is_spoiled: bool) -> None:
-        """The last session continues, with what this model learned last with these sensors.
+        """Expect that the last session continues, with what the model last learned with its sensor.
 
-        If the last file cannot be read, it may have been of other sensors: nothing continues.
+        `is_spoiled`: the last file is unreadable, maybe of another sensor, so nothing continues.
         """
         kept = self.newest_of_each(self.disk)
         self.running, self.others = Session(model, ""), kept
@@ -102,7 +102,7 @@ class Model:
         self.known = [copy(each) for each in (self.running, *self.others)]
 
     def with_sensor(self, sensor: str) -> tuple[Session, Session | None]:
-        """Return what runs with a sensor, and which of the others holds the learning."""
+        """Return the session to run with a sensor, and the kept one with its learning, or None."""
         model = self.running.model
         of_it = [each for each in self.others if each.sensor == sensor]
         learned = next((each for each in of_it if each.model == model), None)
@@ -114,7 +114,7 @@ class Model:
             self.others = self.newest_of_each([self.running, *self.others])[:4]
 
     def see(self, sensor: str) -> None:
-        """Other sensors end the session; those that are back have theirs again."""
+        """Expect another session if the sensor is another one: its own if it was there before."""
         if self.running.sensor in ("", sensor):
             self.running.sensor = sensor
             return
@@ -124,10 +124,10 @@ class Model:
 
 
 class Lives(RuleBasedStateMachine):
-    """A hand's daemon that starts and ends, and the model beside it."""
+    """A daemon that starts and ends in random steps, each compared with `Model`."""
 
     full: list[bool]
-    """Whether the disk refuses to write."""
+    """One item: True if the disk refuses to write."""
 
     @initialize()
     def begin(self) -> None:
@@ -168,7 +168,7 @@ class Lives(RuleBasedStateMachine):
 
     @rule(times=st.sampled_from((1, 1, 3)))
     def lift(self, times: int) -> None:
-        """Outcomes are answered once they are on the disk."""
+        """Judge grasps and report outcomes, which are answered once they are on the disk."""
         for _ in range(times):
             self.number += 1
             judge(self.part, self.number)
@@ -193,7 +193,7 @@ class Lives(RuleBasedStateMachine):
 
     @rule()
     def wait(self) -> None:
-        """All is on the disk after ten seconds."""
+        """Let ten seconds pass, after which all is on the disk unless it is full."""
         self.clock.now_ns += SAVE_PERIOD_NS
         read_once(self.keeper)
         self.may_be_saved()
@@ -215,7 +215,10 @@ class Lives(RuleBasedStateMachine):
 
     @rule(model=MODELS, spoils=st.none() | st.none() | UNREADABLE, is_killed=st.booleans())
     def restart(self, model: str, spoils: bytes | None, is_killed: bool) -> None:
-        """A kill is an end at which nothing can be written any more."""
+        """End the daemon and start it with `model`; a kill is an end at which nothing is written.
+
+        `spoils`: content of an unreadable newest file; None: no such file.
+        """
         self.full[0] = is_killed or self.full[0]
         self.stop()
         counted = None if self.full[0] or model != self.model.running.model else self.counted
@@ -257,7 +260,7 @@ def outcomes_in(kept: KeptSession) -> int:
     return 0 if kept.trust is None else kept.trust.learner.outcomes
 
 
-def test_sessions_of_many_lives_are_as_the_model(
+def test_sessions_after_many_restarts_are_as_the_model_expects(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     full = [False]

@@ -45,7 +45,7 @@ from tests.daemon.session.learning import (
 from tests.daemon.session.robot import Day, Robot
 
 
-def test_another_sensor_is_told_once_and_before_its_readings(
+def test_each_change_of_a_serial_number_is_reported_once(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     driver, exchanges = sensors(), []
@@ -68,7 +68,7 @@ def test_another_sensor_is_told_once_and_before_its_readings(
 
 
 @pytest.mark.parametrize("keep", ["true", "false"])
-def test_an_exchange_is_noticed_with_or_without_a_session(
+def test_an_exchange_is_noticed_with_or_without_kept_sessions(
     tmp_path: Path, keep: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "scene.toml"
@@ -103,7 +103,7 @@ def tables(bts3_dir: Path) -> dict[str, NDArray[np.uint16]]:
     }
 
 
-def test_each_published_day_rests_otherwise_and_no_half(
+def test_rests_differ_between_published_days_not_halves_of_one(
     tables: dict[str, NDArray[np.uint16]],
 ) -> None:
     for grasps in tables.values():
@@ -113,14 +113,14 @@ def test_each_published_day_rests_otherwise_and_no_half(
         assert moved_fingers(rest_above(one), rest_above(other)) == [0]
 
 
-def test_untouched_sensors_rest_as_they_did(untouched: NDArray[np.uint16]) -> None:
+def test_drift_of_untouched_sensors_is_not_an_exchange(untouched: NDArray[np.uint16]) -> None:
     first, last = (np.median(part, axis=0) for part in (untouched[:100], untouched[-100:]))
     assert moved_fingers(first, last) == []
     assert moved_fingers(first, np.roll(last, 1, axis=0)) != []
 
 
 def begin(day: Day, robot: Robot) -> None:
-    """Calibrate by a day, and keep where its sensors rest."""
+    """Calibrate the robot's session by a day, and let the hand be tared at the day's rest."""
     day.teach(robot.pipeline.session, 100)
     verdicts = list(robot.see(day.stream(0, 2)))
     assert len(verdicts) == 2
@@ -128,7 +128,7 @@ def begin(day: Day, robot: Robot) -> None:
 
 
 def first_slips(robot: Robot, day: Day, number: int, grasps: int) -> list[Decision]:
-    """What is said of the first slips of a day."""
+    """Return the decisions on the first `number` slips among a day's first `grasps` grasps."""
     verdicts = robot.see(day.stream(0, grasps))
     slips = (decision for slipped, decision, _ in verdicts if slipped)
     return list(itertools.islice(slips, number))
@@ -138,7 +138,7 @@ def first_slips(robot: Robot, day: Day, number: int, grasps: int) -> list[Decisi
 def test_an_exchange_without_serial_numbers_ends_the_session(
     bts3_dir: Path, tmp_path: Path, interruption: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Without it 10 of the first 12 slips were called stable."""
+    """If the session continued, 10 of the first 12 slips would be called stable."""
     robot = Robot(tmp_path)
     begin(Day("palm_45", bts3_dir), robot)
     getattr(robot, interruption)()
@@ -175,7 +175,7 @@ def taught() -> tuple[SessionCalibration, Trust]:
     return session, part
 
 
-def test_a_hand_that_held_at_the_start_continues_once_open(tmp_path: Path) -> None:
+def test_a_hand_closed_at_start_continues_its_session_once_open(tmp_path: Path) -> None:
     now, (session, part) = [PATTERN], taught()
     with SessionFolder(tmp_path / "right") as folder:
         keeper = session_keeper(session, sensors(), folder, part=part, read_rest=lambda: now[0])
@@ -196,7 +196,7 @@ def test_a_hand_that_held_at_the_start_continues_once_open(tmp_path: Path) -> No
 
 
 def test_a_relay_that_restarts_is_not_an_exchange(tmp_path: Path) -> None:
-    """Its sensors rest as before, whatever port it sends from."""
+    """The sensors behind it rest as before, although it sends from another port."""
     now, (session, part) = [PATTERN], taught()
     driver = sensors(**dict.fromkeys(FINGERS, "udp://192.0.2.1:4001"))
     with SessionFolder(tmp_path / "right") as folder:
@@ -218,8 +218,8 @@ def test_a_relay_that_restarts_is_not_an_exchange(tmp_path: Path) -> None:
     assert (session.grasps, part.learner.outcomes, part.risk.proven) == (0, 0, 0)
 
 
-def test_sensors_that_return_have_their_slips_back(tmp_path: Path) -> None:
-    """The run between did not learn: its session has no outcomes, and is the last one."""
+def test_returning_sensors_get_their_slip_budget_and_outcomes_back(tmp_path: Path) -> None:
+    """A session of other sensors, without outcomes, was the last one that ran."""
     former, now = trust(), trust()
     for grasp in (1, 2):
         named = GraspId(BOOT, grasp)
@@ -242,7 +242,7 @@ def test_sensors_that_return_have_their_slips_back(tmp_path: Path) -> None:
     assert now.learner.outcomes == 2
 
 
-def test_sensors_without_numbers_have_each_their_session(tmp_path: Path) -> None:
+def test_each_set_of_sensors_without_serials_keeps_its_session(tmp_path: Path) -> None:
     """Three hands in turn: the session of each is there when it is back."""
     hands = [PATTERN, HELD, PATTERN - np.linspace(400.0, 0.0, 24)]
     now, session = [hands[0]], calibration()
@@ -260,7 +260,7 @@ def test_sensors_without_numbers_have_each_their_session(tmp_path: Path) -> None
 
 
 def seed(robot: Robot, day: Day) -> None:
-    """Keep the session of recorded grasps that do not say of which sensors they are."""
+    """Restart the robot with a kept session of a day's grasps that does not name its sensors."""
     robot.stop()
     recorded = calibration_of(robot.pipeline)
     day.teach(recorded, 300)
@@ -277,10 +277,10 @@ def calibration_of(pipeline: Pipeline) -> SessionCalibration:
 
 
 @pytest.mark.parametrize("other", ["palm_down", "palm_side"])
-def test_a_seed_of_other_sensors_makes_no_slip_stable(
+def test_a_seeded_session_of_other_sensors_is_not_used(
     bts3_dir: Path, tmp_path: Path, other: str
 ) -> None:
-    """Without the comparison 24 of 25 first slips were called stable."""
+    """If the seeded session were used, 24 of 25 first slips would be called stable."""
     robot = Robot(tmp_path)
     seed(robot, Day("palm_45", bts3_dir))
     slips = first_slips(robot, Day(other, bts3_dir), 15, 40)
@@ -291,7 +291,7 @@ def test_a_seed_of_other_sensors_makes_no_slip_stable(
     assert grasps < 60  # its own only
 
 
-def test_a_seed_is_used_once_live_grasps_fit_it(bts3_dir: Path, tmp_path: Path) -> None:
+def test_a_seeded_session_is_used_once_live_grasps_fit_it(bts3_dir: Path, tmp_path: Path) -> None:
     robot, day = Robot(tmp_path), Day("palm_down", bts3_dir)
     seed(robot, day)
     calibrated = [known for _, _, known in robot.see(day.stream(0, 16))]
@@ -303,8 +303,8 @@ def test_a_seed_is_used_once_live_grasps_fit_it(bts3_dir: Path, tmp_path: Path) 
     robot.stop()
 
 
-def test_a_finger_that_is_tared_alone_ends_nothing() -> None:
-    """It may be one that touches the table for half a minute."""
+def test_taring_one_finger_alone_is_not_an_exchange() -> None:
+    """The finger may touch the table for half a minute and be tared there."""
     now, exchanges = np.full((3, 24), 2000.0), list[object]()
     watch = sensor_watch(sensors(), lambda: exchanges.append(None), now.copy)
     for rest in (2000.0, 0.0, np.linspace(1500.0, 2000.0, 24), 2000.0):

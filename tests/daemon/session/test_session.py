@@ -1,4 +1,4 @@
-"""A session's calibration: taken in, kept, restored, dropped with the sensor."""
+"""A session's calibration: what it learns from, and when it is dropped."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from tests.daemon.session.learning import (
 )
 
 
-def test_a_returning_session_of_another_model_is_new(
+def test_a_new_session_begins_if_the_kept_does_not_fit(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     session, driver = calibration(), sensors(ff="A")
@@ -53,7 +53,7 @@ def test_a_returning_session_of_another_model_is_new(
 
 
 def session_pipeline(age_ns: int = 0, *, learns: bool = True) -> Pipeline:
-    """A judge of readings of the time 0, which are `age_ns` old."""
+    """Return a pipeline without a gate, for which readings made at time 0 are `age_ns` old."""
     model = TactileModel(zoo.find("small-session"))
     return Pipeline(model, FINGERS, Limits(max_age_ns=10**8), lambda: age_ns, learns=learns)
 
@@ -76,7 +76,7 @@ def judge(pipeline: Pipeline, rows: NDArray[np.generic], fault: int = 0) -> list
         (0, 0, False),
     ],
 )
-def test_a_session_learns_only_from_present_readings_if_allowed(
+def test_a_session_learns_only_from_sound_fresh_readings_if_allowed(
     bts3_dir: Path, fault: int, age_ns: int, learns: bool
 ) -> None:
     pipeline = session_pipeline(age_ns, learns=learns)
@@ -93,8 +93,10 @@ GARBAGE: dict[str, Callable[[np.random.Generator], NDArray[np.generic]]] = {
 
 @pytest.mark.parametrize("what", GARBAGE)
 @pytest.mark.parametrize("grasps", [0, 100])
-def test_garbage_never_becomes_its_own_standard(bts3_dir: Path, what: str, grasps: int) -> None:
-    """Neither after real grasps nor from the start: nothing of it is ever called stable."""
+def test_garbage_is_unknown_however_much_of_it_is_seen(
+    bts3_dir: Path, what: str, grasps: int
+) -> None:
+    """All verdicts are `unknown`, both from the start and after real grasps."""
     pipeline = session_pipeline()
     random = np.random.default_rng(1)
     rows = read_table(bts3_dir / "palm_down.csv").counts
@@ -104,7 +106,7 @@ def test_garbage_never_becomes_its_own_standard(bts3_dir: Path, what: str, grasp
 
 
 @pytest.mark.parametrize("grasps", [0, 200])
-def test_a_finger_that_dies_is_never_judged_by_the_others(bts3_dir: Path, grasps: int) -> None:
+def test_a_grasp_with_a_dead_finger_is_always_unknown(bts3_dir: Path, grasps: int) -> None:
     random = np.random.default_rng(3)
     rows = read_table(bts3_dir / "palm_down.csv").counts
     rows = rows[random.permutation(len(rows))].astype(np.int64)
@@ -127,7 +129,7 @@ def test_fingers_exchanged_from_the_first_grasp_are_unknown(
     assert pipeline.health()["session"] is Reason.NOT_CALIBRATED
 
 
-def test_slips_alone_make_no_slip_stable(bts3_dir: Path) -> None:
+def test_a_session_of_mostly_slips_makes_hardly_more_slips_stable(bts3_dir: Path) -> None:
     """After 900 slips hardly any more of a day's slips are called stable than without them."""
     table = read_table(bts3_dir / "palm_side.csv")
     random = np.random.default_rng(8)
@@ -145,7 +147,7 @@ def test_slips_alone_make_no_slip_stable(bts3_dir: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["cnn1", "small-session"])
-def test_the_mean_of_all_grasps_is_never_judged(name: str) -> None:
+def test_the_mean_of_all_training_grasps_is_never_judged(name: str) -> None:
     model = TactileModel(zoo.find(name))
     random = np.random.default_rng(5)
     centre = np.array(model.contract.seen.centre)
@@ -154,7 +156,7 @@ def test_the_mean_of_all_grasps_is_never_judged(name: str) -> None:
     assert {judgement.decision for judgement in judgements} == {Decision.UNKNOWN}
 
 
-def test_an_exchanged_sensor_ends_the_verdict_that_stands() -> None:
+def test_an_exchange_of_sensors_makes_the_current_verdict_unknown() -> None:
     clock = Clock()
     model = TactileModel(zoo.find("cnn1"))
     pipeline = Pipeline(model, FINGERS, Limits(), clock, hand=HandLimits())
