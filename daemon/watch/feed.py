@@ -165,5 +165,6 @@ class Feed:
 
 
 def load_keys(own: Path, daemon: Path) -> tuple[bytes, bytes, bytes]:
-    """Return own public and secret key, and the daemon's public one, Z85. Raises `KeysError`."""
+    """Return public and secret key of the file `own`, then the daemon's public key, from the file
+    `daemon`; all in Z85. Raises `KeysError`."""
     return *load_pair(own), load_public(daemon, "the daemon's key")

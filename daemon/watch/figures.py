@@ -88,12 +88,13 @@ def likely(p_slip: float) -> str:
 
 
 def counted(count: int, what: str) -> str:
-    """Return a count with its noun."""
+    """Return a count with its noun, `what`, given in the singular."""
     return f"{count} {what}{'' if count == 1 else 's'}"
 
 
 def learning(verdict: Verdict | None, status: Status | None) -> list[Line]:
-    """Return lines on session and learning, the most important first; counts of 0 are left out."""
+    """Return lines on learning and session, the most important first, without counts of 0. Empty
+    without a status."""
     if status is None:
         return []
     lines = []
@@ -126,7 +127,7 @@ def _count(what: str, count: int, noun: str, more: str = "") -> list[Line]:
 
 
 def timing(verdict: Verdict | None, status: Status | None, lost: int) -> list[Line]:
-    """Return lines on rates, delays and losses; `lost`: missing or malformed messages here."""
+    """Return lines on rates, delays and losses; `lost`: number of missing or malformed messages."""
     lines = [] if verdict is None else [Line("age", f"{verdict.age_ms:.1f} ms")]
     if status is not None:
         delays = status.latency_us

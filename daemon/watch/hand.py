@@ -95,7 +95,7 @@ def _state(verdict: Verdict, finger: Finger) -> FingerState | None:
 
 
 def _motion(verdict: Verdict, finger: Finger) -> FingerMotion | None:
-    """Return the motion of a finger; None if the finger is free."""
+    """Return the motion of a finger; None if it is free, or the daemon has no gate."""
     if verdict.motion is None or _state(verdict, finger) is FingerState.FREE:
         return None
     limit = (verdict.motion_limits or {}).get(finger, 0.0)

@@ -80,7 +80,7 @@ class FingerImage(msgspec.Struct, frozen=True, kw_only=True):
     marked: list[int]
     """Pixels of electrodes that are broken or repaired."""
     broken: str
-    """Numbers of these electrodes, as text; empty: none."""
+    """Numbers of the broken and repaired electrodes, from 1, as text; empty: none."""
     motion: FingerMotion | None
     """Motion; None: the finger is free, or the daemon has no gate."""
     state: FingerState | None
@@ -116,7 +116,7 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     headline: str
     """Largest word on the screen: the verdict, "leans to stable", or that none has come yet."""
     evidence: str
-    """Result of `figures.rests_on`; empty before the first message."""
+    """Result of `figures.rests_on`; empty while no message comes."""
     p_slip: float | None
     why: list[Line]
     """Reasons of the verdict; the first line begins with one word to show beside it."""
@@ -143,4 +143,4 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     history: list[str]
     """Tones of the last 300 seconds, the oldest first; see `TONE_CODE`."""
     history_p: list[int]
-    """Highest probability of slip in each of these seconds, %; -1: none."""
+    """Highest probability of slip in each second of `history`, %; -1: none."""

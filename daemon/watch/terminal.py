@@ -44,7 +44,7 @@ STYLES = {
 """Style of each tone. Lightness differs too, for people who cannot tell red from green."""
 OLD = "dim italic"
 HAND_COLUMNS = 80
-"""Width of a hand that is shown beside another one, columns."""
+"""Least width of each hand for hands to be shown side by side, columns."""
 HALF_BAR = 10
 """Width of a motion bar up to its mark, which is the limit, columns."""
 NAME_MAX = 40
@@ -55,7 +55,7 @@ LABEL_COLUMNS = 12
 """Width of the longest label, `last message`, columns."""
 SIGNALS_MAX = 64
 CHARACTERS = 6
-"""Place of the control characters in the settings of a terminal."""
+"""Index of the control characters in the result of `termios.tcgetattr`."""
 
 Row = tuple[str, str]
 """Label and text."""
@@ -79,7 +79,7 @@ def show(hands: Sequence[HandFeed]) -> None:
 
 
 class Keyboard:
-    """Typed keys: `q` ends, Tab shows the next hand, space what does not fit."""
+    """Typed keys: `q` ends, Tab shows the next hand, space the next page of what does not fit."""
 
     def __init__(self, stop: StopSignal) -> None:
         """`stop`: signal that also ends the wait."""
@@ -132,8 +132,8 @@ class Keyboard:
 
 
 def draw(hands: Sequence[Snapshot], width: int, chosen: int, page: int) -> RenderableType:
-    """Return tables of all hands, or only of hand number `chosen` if `width` (columns) is too
-    small.
+    """Return tables of all hands side by side. If `width` (columns) is too small for that, only
+    hand number `chosen` has a table, below the verdicts of all.
 
     `page`: number of pages to skip of the lines that do not fit.
     """

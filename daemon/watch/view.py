@@ -41,7 +41,7 @@ from graspd.daemon.watch.snapshot import Line, Link, Snapshot, Tone
 TICK_S = 0.02
 """Time between two looks at the feeds, s, which is the resolution of silence."""
 SNAPSHOTS_HZ = 10
-"""Snapshots a second. A rate is taken over this number of snapshots."""
+"""Number of snapshots a second."""
 OVERLOADED = Line(
     "overloaded",
     "the PC is too busy to judge each reading: end other programs, or use a smaller model",
@@ -66,7 +66,7 @@ A daemon without readings sends the next `unknown` only after `silence_ms`.
 PROMPT_NS = 50_000_000
 """Longest time that a message may have waited here and still serve to compare the clocks, ns."""
 AGE_MAX_MS = 1e12
-"""Longest age of a reading that is reckoned with, ms, 30 years: any more may be no number of ns."""
+"""Largest age of a reading in calculations, ms (30 years); a larger one may be infinite in ns."""
 CATCHING_UP_NS = 1_000_000_000
 """Time to reconnect after the viewer itself stood still, ns."""
 NO_SHARE = -1
@@ -191,7 +191,7 @@ class View:
         self._grasps.take(verdict, now_ns)
 
     def _arrival_ns(self, verdict: Verdict, earliest_ns: int, latest_ns: int) -> int:
-        """Return the arrival of a verdict, ns, by its own time, because it may have waited here."""
+        """Return when a verdict arrived, ns, estimated by its own time, as it may have waited."""
         sent_ns = verdict.t_mono_ns + round(min(verdict.age_ms, AGE_MAX_MS) * 1e6)
         if self._verdict_ns < self.stood_still[1]:
             self._clocks_ns = None  # one of the clocks may have stopped in a sleep of the computer

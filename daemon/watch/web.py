@@ -83,7 +83,7 @@ class Server(ThreadingHTTPServer):
         super().__init__((ADDRESS, port), _Handler)
 
     def process_request(self, request: Any, client_address: Any) -> None:  # noqa: ANN401
-        """Serve a connection in a thread, if one is free."""
+        """Serve a connection in a thread, or close it if `CONNECTIONS_MAX` are in use."""
         if self._places.acquire(blocking=False):
             super().process_request(request, client_address)
         else:

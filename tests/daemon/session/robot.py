@@ -62,7 +62,7 @@ class Robot:
         self.clock.now_ns += OUTAGE_NS
 
     def see(self, grasps: WholeGrasps) -> Iterator[tuple[bool | None, Decision, bool]]:
-        """Yield for each grasp if it slips, its first decision, and if it is calibrated."""
+        """Yield per grasp if it slips, its first decision, and if the session is calibrated."""
         judged = 0
         begin_ns = self.clock.now_ns
         for row in grasps:

@@ -71,7 +71,7 @@ class Model:
         self.known: list[Session] = []  # what there was at the start, or at the last save
 
     def save(self) -> None:
-        """Expect a save: five sessions stay, and an empty one that runs; other empty ones go first."""
+        """Expect a save: five sessions stay, and a running empty one; other empty ones go first."""
         now = [copy(each) for each in (self.running, *self.others)]
         if now == self.known:
             return  # nothing is written where nothing is new

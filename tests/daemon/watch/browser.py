@@ -1,4 +1,4 @@
-"""Servers of the page, and a headless Chromium, told by the DevTools protocol over a pipe."""
+"""Servers of the page, and a headless Chromium, driven by the DevTools protocol over a pipe."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.daemon.watch.watch_fakes import Talker
 from tests.kit.waiting import PATIENCE_S, wait_until
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
-"""Where it is; None where there is none."""
+"""Path of Chromium; None: not installed."""
 FLAGS = (
     *("--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"),
     *("--no-first-run", "--disable-extensions", "--disable-background-networking"),
@@ -36,7 +36,7 @@ BANNER = "document.querySelector('.banner')"
 
 @contextlib.contextmanager
 def serving(publish: Callable[[Newest], object], port: int = 0) -> Iterator[Server]:
-    """Serve the page while `publish` puts snapshots."""
+    """Serve the page, and put snapshots by `publish` in a thread. `port` 0: any free one."""
     server = Server(port, Newest())
     jobs = (lambda: server.serve_forever(0.01)), (lambda: publish(server.newest))
     threads = [threading.Thread(target=job) for job in jobs]
@@ -84,7 +84,7 @@ class Page:
 
 @contextlib.contextmanager
 def serving_hands(make: Callable[[int], list[Snapshot]]) -> Iterator[str]:
-    """Serve what `make` gives for 0, 1, 2 ..., twenty times a second; the address of the page."""
+    """Serve the snapshots `make(0)`, `make(1)` ..., twenty a second; yield the page's address."""
     over = threading.Event()
 
     def publish(newest: Newest) -> None:
@@ -101,7 +101,7 @@ def serving_hands(make: Callable[[int], list[Snapshot]]) -> Iterator[str]:
 
 
 class Browser:
-    """One page at a time. Ends with the block."""
+    """A headless Chromium with one page at a time, which ends with the block."""
 
     def __init__(self, profile: Path) -> None:
         """`profile` is an empty folder for what the browser keeps."""
@@ -140,7 +140,7 @@ class Browser:
 
     @contextlib.contextmanager
     def blank(self) -> Iterator[Self]:
-        """Show a new page meanwhile, which knows nothing of those before it."""
+        """Show a new page in the block, in a context without cookies or storage of former ones."""
         context = self._ask("Target.createBrowserContext")["browserContextId"]
         where = {"url": "about:blank", "browserContextId": context}
         page = self._ask("Target.createTarget", **where)["targetId"]
@@ -152,11 +152,11 @@ class Browser:
         self._ask("Target.disposeBrowserContext", browserContextId=context)
 
     def ask(self, method: str, **parameters: object) -> Answer:
-        """What the page answers."""
+        """Send a DevTools command to the page, and return its answer."""
         return self._ask(method, self._session, **parameters)
 
     def look(self, width: int, height: int, theme: Literal["light", "dark"] = "light") -> None:
-        """Make the window so large, and prefer a theme."""
+        """Set the size of the window, pixels, and the preferred theme."""
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
         self.ask("Emulation.setDeviceMetricsOverride", **size)
         feature = {"name": "prefers-color-scheme", "value": theme}
@@ -213,7 +213,7 @@ class Browser:
 
 
 def see(browser: Browser, tone: str, *more: str) -> None:
-    """Wait until the page of the first hand has a tone, and whatever else is true at that time.
+    """Wait until the first hand has a tone, and all scripts in `more` are true at that moment.
 
     Scripts that are asked one after the other may see silence: a busy computer stands still.
     """

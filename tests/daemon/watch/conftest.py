@@ -1,4 +1,4 @@
-"""The page, who talks to it, and the browser that shows it."""
+"""Fixtures: the page's server, a publisher of messages for it, and the browser."""
 
 from __future__ import annotations
 

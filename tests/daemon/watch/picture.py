@@ -1,4 +1,4 @@
-"""Makes `deploy/watch.png`: `python -m tests.daemon.watch.picture`, six minutes long.
+"""Makes `deploy/watch.png`: `python -m tests.daemon.watch.picture`, which takes six minutes.
 
 It runs the demo scene and `graspd watch --web`, waits until five minutes are behind it and a grasp
 is `stable` by what lifts have shown, and takes a picture of 1280 x 860.
@@ -26,7 +26,7 @@ SOLID = "document.querySelector('.banner').dataset.tone == 'stable'"
 
 
 def main(picture: Path = PICTURE) -> None:
-    """Take the picture."""
+    """Take the picture and write it to `picture`."""
     with contextlib.ExitStack() as stack:
         profile = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         for words in (["run"], ["watch", "--web"]):

@@ -61,7 +61,7 @@ def test_messages_that_waited_unread_are_not_shown(endpoint: str) -> None:
             assert decode_verdict(payload).seq == 50
 
 
-def test_a_message_is_as_old_as_the_last_empty_queue(endpoint: str) -> None:
+def test_an_unread_messages_age_counts_from_the_last_empty_queue(endpoint: str) -> None:
     clock, view = Clock(), View(endpoint)
     found: list[bytes] = []
     with Publisher(endpoint) as publisher, Feed(endpoint, clock=clock) as feed:
@@ -82,7 +82,7 @@ def test_a_message_is_as_old_as_the_last_empty_queue(endpoint: str) -> None:
 
 @pytest.fixture
 def door(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[KeyedDoor]:
-    """A door that knows `controller` and not `stranger`."""
+    """A daemon's sockets that accept the key of `controller` and refuse that of `stranger`."""
     made = KeyedDoor(tmp_path, monkeypatch)
     made.client("stranger", tmp_path / "theirs")
     yield made
@@ -126,7 +126,7 @@ def test_a_peer_that_is_turned_away_sees_why(
         assert said in feed.link
 
 
-def test_a_refused_viewer_is_let_in_with_a_known_key(tmp_path: Path, door: KeyedDoor) -> None:
+def test_a_refused_viewer_connects_once_its_key_is_known(tmp_path: Path, door: KeyedDoor) -> None:
     clock = Clock()
     with Feed(door.endpoint, keys_of(tmp_path, "stranger"), clock) as feed:
         hears(door, feed, lambda _: feed.link.is_turned_away)
@@ -139,7 +139,7 @@ def test_a_refused_viewer_is_let_in_with_a_known_key(tmp_path: Path, door: Keyed
         assert feed.link == "connected"
 
 
-def test_keys_that_are_wrong_are_said(tmp_path: Path) -> None:
+def test_wrong_key_files_are_refused_with_the_cause(tmp_path: Path) -> None:
     make(tmp_path, "own")
     own = tmp_path / "own.key_secret"
     empty = tmp_path / "empty.key"

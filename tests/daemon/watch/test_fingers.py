@@ -16,7 +16,7 @@ WIDTH = 11
 
 
 def rested(readings: int = 30) -> View:
-    """A view that has seen an open hand at rest."""
+    """Return a view that has seen this number of readings of an open hand at rest."""
     view = after((b"status.right", status(0, health={})))
     for seq in range(readings):
         view.take(b"verdict.right", verdict(seq), 0)
@@ -25,7 +25,7 @@ def rested(readings: int = 30) -> View:
 
 
 def images(view: View, *counts: list[int], faulty: tuple[int, ...] = ()) -> list[FingerImage]:
-    """The images of one more reading, while the hand closes."""
+    """Return the images of one more reading, `counts` of ff and th, while the hand closes."""
     view.take(b"verdict.right", verdict(98, gate=GateState.CLOSING), 0)
     view.take(b"tactile.right", tactile(99, *counts, faulty=faulty), 0)
     return view.snapshot(0).fingers
@@ -34,7 +34,7 @@ def images(view: View, *counts: list[int], faulty: tuple[int, ...] = ()) -> list
 @pytest.mark.parametrize(
     ("fall", "level"), [(0, 0), (16, 10), (400, 50), (1600, 100), (3000, 100), (-400, -50)]
 )
-def test_a_pixel_shows_the_root_of_its_fall(fall: int, level: int) -> None:
+def test_a_pixels_level_is_the_root_of_the_electrodes_fall(fall: int, level: int) -> None:
     """Root of the share of 1600 counts, in %: 16 / 1600 = 0.1 squared."""
     first, second = images(rested(), [3000 - fall] * 24, RESTING)
     assert (first.name, first.from_rest, first.deepest) == ("ff", True, fall)
@@ -42,7 +42,7 @@ def test_a_pixel_shows_the_root_of_its_fall(fall: int, level: int) -> None:
     assert second.levels == [0] * 132
 
 
-def test_an_electrode_is_where_the_layout_has_it() -> None:
+def test_an_electrode_is_drawn_where_the_layout_places_it() -> None:
     """E7 stands in row 8, column 1 of D1 (the paper's table)."""
     first, _ = images(rested(), [3000] * 6 + [1400] + [3000] * 17, RESTING)
     assert (D1.rows[6], D1.columns[6]) == (8, 1)
@@ -69,7 +69,7 @@ def test_without_a_rest_an_image_shows_how_electrodes_differ() -> None:
     assert flat.levels == [0] * 132
 
 
-def test_faulty_and_repaired_electrodes_are_marked_and_no_touch() -> None:
+def test_faulty_and_repaired_electrodes_are_marked_and_show_no_touch() -> None:
     view = rested()
     counts = [3000] * 24
     counts[6] = 0
@@ -84,8 +84,8 @@ def test_faulty_and_repaired_electrodes_are_marked_and_no_touch() -> None:
     assert (nothing.levels, len(nothing.marked)) == ([0] * 132, 24)
 
 
-def test_a_broken_electrode_is_crossed_in_an_open_hand_too() -> None:
-    """Electrode 7 stands still at 0 counts, and no word of it is faulty."""
+def test_a_broken_electrode_is_marked_in_an_open_hand_too() -> None:
+    """Electrode 7 stays at 0 counts without a fault flag; only the status names it."""
     view = rested()
     view.take(b"status.right", status(1, health={"ff_7": Reason.ELECTRODE_DEAD}), 0)
     view.take(b"tactile.right", tactile(99, [3000] * 6 + [0] + [3000] * 17, RESTING), 0)
@@ -106,7 +106,7 @@ def test_images_go_when_readings_no_longer_come() -> None:
 
 
 def told_of(**told: Any) -> list[FingerImage]:  # noqa: ANN401
-    """The images beside a verdict that says this."""
+    """Return the images beside a verdict with these fields."""
     reading = b"tactile.right", tactile(0, RESTING, RESTING)
     return after(reading, (b"verdict.right", verdict(0, **told))).snapshot(0).fingers
 
@@ -128,5 +128,5 @@ def test_unknown_motion_of_a_finger_is_not_zero(
 
 
 @pytest.mark.parametrize("told", [{"ff": "slide", "th": None}, {"ff": "slide"}, None])
-def test_a_finger_has_its_word_or_none(told: dict[str, Any] | None) -> None:
+def test_a_finger_has_the_state_in_the_verdict_or_none(told: dict[str, Any] | None) -> None:
     assert [each.state for each in told_of(fingers=told)] == [told and "slide", None]

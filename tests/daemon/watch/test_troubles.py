@@ -71,7 +71,7 @@ def test_a_viewer_that_stood_still_says_so_itself() -> None:
     assert seen.history == ["s", "", "", "", "", "", "."]
 
 
-def test_a_silent_daemon_has_the_commands_to_look_with() -> None:
+def test_advice_on_silence_depends_on_the_state_of_the_link() -> None:
     look = "systemctl status graspd@right; journalctl -u graspd@right"
     view = View(ENDPOINT, look=look)
     assert view.snapshot(0).why[-1] == Line("look", look)
@@ -105,7 +105,7 @@ SERVICE = "systemctl status graspd@left; journalctl -u graspd@left"
         ("tcp://10.0.0.2:5556", None, "on the daemon's computer: systemctl status 'graspd@*'"),
     ],
 )
-def test_where_to_look_is_a_command_of_this_daemon(
+def test_advice_names_commands_for_this_endpoint_and_scene(
     endpoint: str, scene: str | None, look: str
 ) -> None:
     found, doctor = where_to_look(endpoint, None if scene is None else Path(scene))
@@ -113,7 +113,7 @@ def test_where_to_look_is_a_command_of_this_daemon(
     assert f"graspd doctor {scene or 'SCENE'}; the daemon's log says why" in doctor
 
 
-def test_a_verdict_says_what_it_rests_on() -> None:
+def test_the_evidence_names_network_lifts_slips_and_target() -> None:
     seen = after((b"verdict.right", verdict(0, Decision.STABLE))).snapshot(0)
     network = "slip probability by the network alone 30 %"
     lifts = "rests on 57 lifts; of 41 `stable` ones 2 slipped, target 10 %"

@@ -34,7 +34,7 @@ ODD: tuple[object, ...] = (
     *(0, -1, 2**63, 1e308, 1e-320, "", "x" * 5000, "\x1b[2J"),
     *([], [[]], [0] * 1000, ["\x1b[2J"], {}, {"": 0}, None, True),
 )
-"""Values in places where others belong."""
+"""Values to put into fields of messages where others belong."""
 
 
 def risk(**other: Any) -> RiskReport:  # noqa: ANN401
@@ -60,7 +60,7 @@ def test_before_the_first_message_it_is_unknown_and_says_why() -> None:
     ("outcome", "tone", "p_slip"),
     [(Decision.STABLE, Tone.STABLE, 0.25), (Decision.SLIP, Tone.SLIP, 0.75)],
 )
-def test_a_verdict_stands_until_its_silence_is_over(
+def test_a_verdict_is_shown_until_its_silence_limit_has_passed(
     outcome: Decision, tone: Tone, p_slip: float
 ) -> None:
     view = after((b"verdict.right", verdict(0, outcome)))
@@ -80,7 +80,7 @@ def test_a_repeated_message_is_not_a_sign_of_life() -> None:
     assert view.snapshot(101 * MS).tone is Tone.SILENT
 
 
-def test_an_absurd_age_is_shown_and_ends_nothing() -> None:
+def test_a_verdict_with_an_absurd_age_is_still_shown() -> None:
     assert seen_after(Decision.SLIP, age_ms=1e308).headline == "slip"
 
 
@@ -131,7 +131,7 @@ def test_unknown_shows_whether_something_is_wrong(reasons: list[Reason], tone: T
     assert [(line.what, line.advice) for line in seen.why] == why
 
 
-def test_an_overload_is_the_cause_and_a_cable_is_not() -> None:
+def test_in_overload_the_advice_names_overload_not_a_cable() -> None:
     view = after((b"status.right", status(0, overloaded=True, health={})))
     view.take(b"verdict.right", verdict(0, reasons=[Reason.SEQUENCE_GAP, Reason.MOVING]), 0)
     seen = view.snapshot(0)
@@ -143,8 +143,8 @@ def test_an_overload_is_the_cause_and_a_cable_is_not() -> None:
 
 
 @pytest.mark.parametrize(("late", "not_well"), [(5, ""), (6, "not well: late")])
-def test_many_late_verdicts_of_a_second_are_not_well(late: int, not_well: str) -> None:
-    """A hundred readings follow thousands that were late."""
+def test_over_five_percent_late_readings_are_reported_not_well(late: int, not_well: str) -> None:
+    """In the second there are 100 readings; those late before it do not count."""
     view = after((b"verdict.right", verdict(0)))
     for second, count in enumerate((5000, 5000 + late)):
         at_ns = second * 1000 * MS
@@ -157,7 +157,7 @@ def test_many_late_verdicts_of_a_second_are_not_well(late: int, not_well: str) -
     ("p_slip", "words"),
     [(0.0, "< 1 %"), (0.0099, "< 1 %"), (0.01, "1 %"), (0.254, "25 %"), (0.991, "> 99 %")],
 )
-def test_no_slip_is_called_impossible_or_certain(p_slip: float, words: str) -> None:
+def test_no_slip_probability_is_shown_as_0_or_100_percent(p_slip: float, words: str) -> None:
     assert likely(p_slip) == words
 
 
@@ -200,7 +200,7 @@ def test_a_stable_without_evidence_only_leans_to_it(change: dict[str, Any], why:
         (Decision.STABLE, [], Tone.LEANS),
     ],
 )
-def test_a_supervised_lift_is_told_apart(
+def test_supervised_lifts_are_advised_unless_other_reasons_forbid(
     decision: Decision, reasons: list[Reason], tone: Tone
 ) -> None:
     seen = seen_after(decision, reasons=reasons, supervised=True)
@@ -209,7 +209,7 @@ def test_a_supervised_lift_is_told_apart(
     assert "lift" not in [line.what for line in seen.why]
 
 
-def test_learning_shows_untold_lifts_first() -> None:
+def test_learning_lists_lifts_without_reported_outcome_first() -> None:
     lifts = Lifts(reported=41, outstanding=1, unreported=3, covered=False)
     told = {OutcomeStatus.TAKEN: 57, OutcomeStatus.CONTRADICTS: 1}
     learner = LearnerHealth(enabled=True, outcomes=57, told=told, uncertainty=0.41)
@@ -236,7 +236,7 @@ def outcome(grasp: int, ended: Literal["stable", "slip"], judged_by: str | None 
     return encode(told)
 
 
-def test_the_last_grasps_stay_with_how_their_lifts_ended() -> None:
+def test_the_last_grasps_are_listed_with_their_lifts_outcomes() -> None:
     view = a_view()
     decisions = {9: Decision.SLIP, 10: Decision.UNKNOWN}
     for grasp in range(1, 12):
@@ -290,7 +290,7 @@ def test_a_grasp_is_listed_with_its_last_judgement(
     ],
     ids=["one", "both", "next", "gap", "hour"],
 )
-def test_a_second_keeps_all_its_tones(
+def test_each_second_keeps_its_tones_and_highest_slip_probability(
     moments: list[tuple[int, Tone, float | None]], seconds: list[tuple[str, int]]
 ) -> None:
     history = History()

@@ -40,7 +40,7 @@ COLOURS = {
     },
     "dark": {"stable": "rgb(31, 128, 64)", "slip": "rgb(208, 53, 60)", "leans": "rgb(23, 27, 34)"},
 }
-"""Green and red of both themes, as the page's style has them, and what is not promised."""
+"""Colours of the banner by theme and tone, as in the page's style; `leans`: not filled."""
 
 
 def is_of(colour: str) -> str:
@@ -190,7 +190,7 @@ def test_a_whole_hand_fits_one_window_and_several_one_page(
 
 
 def note_tones(browser: Browser) -> None:
-    """Keep in `tones` what the page shows from now on, or since it was frozen."""
+    """Have the page collect in `tones` each tone that it shows; a freeze empties the list."""
     browser.value(
         "tones = []; document.addEventListener('freeze', () => { tones = []; });"
         f" new MutationObserver(() => {{ const tone = {BANNER}.dataset.tone;"
@@ -223,7 +223,7 @@ def test_a_frozen_page_shows_unknown_and_nothing_that_waited(
 def test_after_a_sleep_the_page_shows_unknown_first(
     page: Page, talker: Talker, browser: Browser
 ) -> None:
-    """Only the wall clock has gone on meanwhile."""
+    """The page's wall clock jumps by an hour, as in a sleep."""
     show(browser, page, talker, Decision.STABLE)
     note_tones(browser)
     browser.value("(real => { tones = []; Date.now = () => real() + 3600000; })(Date.now)")
@@ -242,8 +242,8 @@ def test_a_page_in_the_background_shows_no_verdict(
         see(browser, tone, f"document.title == {word} + ' - graspd'")
 
 
-def test_snapshots_that_waited_on_their_way_are_not_shown(browser: Browser) -> None:
-    """The way gets five seconds longer, as through a tunnel that hung."""
+def test_snapshots_that_arrive_late_are_shown_as_silence(browser: Browser) -> None:
+    """Snapshots begin to arrive five seconds late, as through a tunnel that hung."""
     late_s = 0.0
     view = View("ipc:///tmp/any", wall=lambda: time.time() - late_s)
 

@@ -35,7 +35,7 @@ def port() -> int:
 
 
 class Terminal:
-    """A pseudo-terminal with a command in it."""
+    """A pseudo-terminal in which `graspd watch` runs."""
 
     def __init__(self, *arguments: str, columns: int = 80, lines: int = 24) -> None:
         self._arguments = arguments
@@ -62,13 +62,13 @@ class Terminal:
         os.close(self._ours)
 
     def read_until(self, pattern: bytes) -> None:
-        """Wait until the command has written something since the last time."""
+        """Wait until what the command writes from now on matches `pattern`."""
         self.output = b""
         os.set_blocking(self._ours, False)
         wait_until(lambda: self.read() or re.search(pattern, self.output, re.DOTALL), 0.02)
 
     def read(self) -> bool:
-        """Take what the command has written; return False."""
+        """Add what the command has written to `output`; always return False."""
         with contextlib.suppress(BlockingIOError, OSError):
             while part := os.read(self._ours, 1 << 16):
                 self.output += part
@@ -81,7 +81,7 @@ class Terminal:
         fcntl.ioctl(self._ours, termios.TIOCSWINSZ, struct.pack("HHHH", lines, columns, 0, 0))
 
     def end(self) -> int:
-        """Wait for the command; its exit code."""
+        """Wait until the command ends; return its exit code."""
         wait_until(lambda: self.read() or self.process.poll() is not None, 0.02)
         self.read()
         return self.process.returncode
@@ -95,7 +95,7 @@ def endpoint(tmp_path: Path) -> str:
     return f"ipc://{tmp_path}/v"
 
 
-def test_it_shows_verdicts_and_silence_and_ends_cleanly(endpoint: str) -> None:
+def test_watch_in_a_terminal_shows_verdicts_and_ends_cleanly(endpoint: str) -> None:
     with Talker(endpoint) as talker, Terminal("--connect", endpoint) as terminal:
         terminal.read_until(re.escape(ENTER))
         talker.decision = Decision.SLIP
@@ -170,7 +170,7 @@ def test_several_scenes_are_one_page_of_one_process(tmp_path: Path, port: int) -
         (["--connect", "ipc:///tmp/x"] * 9, "9 hands are more than the 8 that can be watched"),
     ],
 )
-def test_what_is_wrong_is_said_in_a_line(
+def test_wrong_arguments_are_refused_with_a_message(
     arguments: list[str], said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "nice", lambda _more: 0)

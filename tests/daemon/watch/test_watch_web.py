@@ -22,7 +22,7 @@ def server() -> Iterator[Server]:
 
 
 def ask(server: Server, path: str = "/", method: str = "GET", **headers: str) -> tuple[int, bytes]:
-    """Status and body."""
+    """Send a request; return status and body of the answer. `headers`: with `_` for `-`."""
     with closing(http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=100)) as link:
         link.putrequest(method, path, skip_host=True)
         for name, value in {"Host": f"127.0.0.1:{server.server_port}", **headers}.items():
@@ -33,7 +33,7 @@ def ask(server: Server, path: str = "/", method: str = "GET", **headers: str) ->
 
 
 def opened(server: Server, stack: ExitStack) -> socket.socket:
-    """A page's stream of snapshots, its head read."""
+    """Return a connection that streams snapshots, as to a page; the answer's head is read."""
     link = stack.enter_context(socket.create_connection(("127.0.0.1", server.server_port), 10))
     link.sendall(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
     head = b""
@@ -75,12 +75,12 @@ OTHERS = (
 
 
 @pytest.mark.parametrize("host", [*OURS, *OTHERS])
-def test_only_names_of_this_computer_are_answered(server: Server, host: str) -> None:
+def test_only_host_names_of_this_computer_are_answered(server: Server, host: str) -> None:
     assert ask(server, Host=host)[0] == (200 if host in OURS else 421)
     assert host in OURS or ask(server, "/events", Host=host)[0] == 421
 
 
-def test_two_names_or_none_are_refused(server: Server) -> None:
+def test_requests_with_two_host_headers_or_none_are_refused(server: Server) -> None:
     assert server.server_address[0] == "127.0.0.1"
     for head in (b"", b"Host: localhost\r\nHost: evil.example\r\n"):
         with socket.create_connection(("127.0.0.1", server.server_port), 10) as link:
@@ -97,7 +97,7 @@ def test_two_names_or_none_are_refused(server: Server) -> None:
         ("/%2e%2e/view.py", "none", 404),
     ],
 )
-def test_only_the_page_itself_gets_what_is_there(
+def test_cross_site_requests_and_unknown_paths_are_refused(
     server: Server, path: str, site: str, status: int
 ) -> None:
     assert ask(server, path, Sec_Fetch_Site=site)[0] == status
@@ -124,7 +124,7 @@ def test_a_malformed_request_ends_only_its_connection(server: Server, sent: byte
     assert ask(server)[0] == 200
 
 
-def test_a_page_gets_nothing_old_and_all_that_follows(server: Server) -> None:
+def test_a_new_page_gets_no_old_and_all_new_snapshots(server: Server) -> None:
     server.newest.put(b'{"n":1}')
     server.newest.put(b'{"n":2}')
     with ExitStack() as stack:

@@ -1,4 +1,4 @@
-"""Messages to watch, views of them, and a publisher of them."""
+"""Messages for a viewer, views that took them, and a publisher that sends them."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def verdict(seq: int, decision: Decision = Decision.UNKNOWN, **other: Any) -> by
 
 
 def tactile(seq: int, *counts: list[int], faulty: tuple[int, ...] = ()) -> bytes:
-    """Return a message of `ff` and `th`; `faulty`: electrodes of `ff`, from 0."""
+    """Return a message with `counts` of `ff` and `th`; `faulty`: electrodes of `ff`, from 0."""
     faults = [[0] * 24 for _ in counts]
     for electrode in faulty:
         faults[0][electrode] = 1
@@ -92,7 +92,7 @@ LEARNER = LearnerHealth(enabled=True, outcomes=5, told={OutcomeStatus.TAKEN: 5},
 
 
 def whole_hand(view: View, hand: str, decision: Decision, seq: int = 0) -> Snapshot:
-    """Five fingers that all move and touch, with many joints, lifts and a learner."""
+    """Give `view` messages of five fingers that all touch, with many joints; return a snapshot."""
     joints = {f"{name}J{joint}": 0.5 for name in ("FF", "MF", "RF", "TH") for joint in range(6)}
     reading = {"fingers": FIVE, "counts": [RESTING] * 5, "faults": [[0] * 24] * 5, "joints": joints}
     said = verdict(
@@ -121,7 +121,7 @@ def text_of(
     *,
     colours: bool = False,
 ) -> list[str]:
-    """The lines of a terminal, without colours unless they are asked for."""
+    """Return the lines that a terminal shows, with colour codes only if `colours`."""
     hands = seen if isinstance(seen, list) else [seen]
     file = io.StringIO()
     system: Literal["truecolor"] | None = "truecolor" if colours else None
@@ -133,15 +133,15 @@ def text_of(
 
 
 class Talker:
-    """A daemon that says what it is told, fifty times a second, until the block ends."""
+    """Stands for a daemon: sends messages with `decision` fifty times a second in the block."""
 
     def __init__(self, endpoint: str) -> None:
         self.decision: Decision | None = Decision.UNKNOWN
-        """What the verdicts are; none come if None."""
+        """Decision of the verdicts; None: nothing is sent."""
         self.more: dict[str, Any] = {}
-        """What else they say."""
+        """Other fields of the verdicts."""
         self.sent = 0
-        """How often status, counts and verdict were sent."""
+        """Number of times that status, counts and verdict were sent."""
         self._publisher = Publisher(endpoint)
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._talk)
@@ -156,7 +156,7 @@ class Talker:
         self._publisher.close()
 
     def wait_for(self, number: int) -> None:
-        """Wait until this number of verdicts more was sent."""
+        """Wait until `number` more verdicts were sent."""
         last = self.sent + number
         wait_until(lambda: self.sent >= last)
 
