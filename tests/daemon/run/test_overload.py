@@ -256,7 +256,7 @@ class BusySelector(selectors.SelectSelector):
         return super().select(0.0)
 
 
-def test_a_loop_that_only_works_in_its_selector_rests() -> None:
+def test_a_loop_kept_busy_by_its_selector_yields_the_processor() -> None:
     rests_s: list[float] = []
     clock = Clock()
     driver = FakeDriver([], clock)
