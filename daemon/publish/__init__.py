@@ -1,8 +1,8 @@
-"""Messages, sockets, the process that holds these, questions of peers, and keys."""
+"""Messages to subscribers, questions of peers, their keys, and the process with the sockets."""
 
 
 class PublishError(Exception):
-    """An endpoint cannot be opened, or its thread has ended."""
+    """An endpoint cannot be opened or served, or has no subscriber."""
 
     taken: str | None = None
     """Endpoint that is in use by another program; None: the error has another cause."""

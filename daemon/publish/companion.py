@@ -17,8 +17,7 @@ R = TypeVar("R")
 
 
 class Told(StrEnum):
-    """Result of reporting an outcome. The value of a refusal is the first word of `why` on the
-    wire."""
+    """Result of reporting an outcome. On the wire, the `why` of a refusal begins with its value."""
 
     KEPT = "kept"
     REPEATED = "repeated"
@@ -42,7 +41,7 @@ class Reply(NamedTuple):
 
 KEPT: Final = Reply(Told.KEPT)
 Answer = Callable[[Reply], None]
-"""Function that answers a peer."""
+"""Function that is called with the reply to a peer."""
 
 
 def at_once(answer: Answer) -> None:
@@ -68,7 +67,7 @@ class PublishedVerdict(NamedTuple):
     judgement: Judgement
     verdict: Verdict
     payload: bytes
-    """JSON."""
+    """The verdict as JSON."""
     reading: TactileReading | None
     """Reading that was judged; None: the verdict reports silence."""
     is_answer: bool
@@ -76,7 +75,7 @@ class PublishedVerdict(NamedTuple):
     grasp: GraspId
     lifts: LiftBook
     keep: Callable[[Answer], None] = at_once
-    """Function that calls its argument once the state at this verdict is on the disk."""
+    """Calls its argument, with a `Reply`, once the state at this verdict is saved or cannot be."""
 
 
 class Requests(Protocol):
@@ -109,7 +108,7 @@ class Companion:
         return None
 
     def on_reading(self, reading: Reading) -> None:
-        """A reading has come. It is judged, or skipped, after this call."""
+        """A reading has come. A tactile one is judged, or skipped, after this call."""
 
     def on_event(self, event: LoopEvent) -> None:
         """An event has come before the next reading."""
@@ -140,7 +139,7 @@ class Companion:
 def hooks(
     companions: Iterable[Companion], hook: Callable[Concatenate[Any, P], R]
 ) -> tuple[Callable[P, R], ...]:
-    """Return the methods that override `hook`, a method of `Companion`, in their order."""
+    """Return the companions' methods that override `hook`, a method of `Companion`, in order."""
     name = hook.__name__
     return tuple(
         getattr(companion, name)

@@ -25,7 +25,7 @@ CLIENTS_MAX = 1000
 """Most keys of peers."""
 FILE_MAX_BYTES = 1 << 16
 SERVICE = "graspd"
-"""User of the service, whose keys root may read."""
+"""User of the service; a program of root accepts keys that belong to this user."""
 LINKS_MAX = 40
 """Most symbolic links on the way to a file (path_resolution(7))."""
 
@@ -35,12 +35,12 @@ class KeysError(SceneError):
 
 
 class Clients(NamedTuple):
-    """Peers that may connect."""
+    """Keys of peers in a folder: the admitted ones, and errors of the others."""
 
     admitted: dict[bytes, str]
     """Name of each peer by its public key, Z85."""
     refused: list[str]
-    """Errors of the other key files."""
+    """Error of each other key file, as text with its path."""
 
 
 def make(folder: Path, name: str) -> tuple[Path, Path]:
@@ -89,12 +89,12 @@ def load_own(path: Path) -> tuple[bytes, bytes]:
 
 
 def load_public(path: Path, what: str = "the key") -> bytes:
-    """Return the public key, Z85, of a file. Raises `KeysError`."""
+    """Return the public key, Z85, of a file. Raises `KeysError`, which calls it `what`."""
     return _load(path, what)[0]
 
 
 def load_clients(folder: Path) -> Clients:
-    """Read the key files of a folder. Raises `KeysError` if other users may write it."""
+    """Read a folder of key files. Raises `KeysError` if it is missing or others may write it."""
     _refuse_open(folder)
     try:
         paths = sorted(path for path in folder.iterdir() if path.suffix == PUBLIC)
@@ -121,7 +121,7 @@ class Admission:
     admitted: Mapping[bytes, str] = field(default_factory=dict)
     """Name of each peer, by its public key, Z85."""
     seen: object = None
-    """State of the folder when it was read."""
+    """`state` of the folder when it was last read; None: not read yet."""
 
     def look(self) -> bool:
         """Read the folder if it has changed; return True if a key was removed.
@@ -192,7 +192,7 @@ def _load(path: Path, what: str) -> tuple[bytes, bytes | None]:
 
 
 def _refuse_open(path: Path) -> None:
-    """Raise `KeysError` if another user may replace a path or a folder on the way."""
+    """Raise `KeysError` if another user may replace a file or a folder or link on its path."""
     at, ahead, links = Path("/"), [*reversed((Path.cwd() / path).parts[1:])], 0
     while True:
         try:

@@ -81,7 +81,7 @@ class Listener:
         return self.socket.fileno()
 
     def close(self) -> None:
-        """Stop listening, and remove both files. May be called again."""
+        """Stop listening; remove the socket's file and `PATH.lock`. May be called again."""
         if self.socket is not None:
             self.socket.close()
         lock, self._lock = self._lock, None

@@ -37,7 +37,7 @@ DECISION_CODE: dict[Decision, Literal[0, 1, 2]] = {
 
 
 Owner = Literal["you", "another"]
-"""The peer that owns a grasp: the one that asks, or another; or the one that asks may not lift."""
+"""Owner of a grasp: `you`, the peer that asks, or `another`, also if the asker may not lift."""
 
 
 class _Message(msgspec.Struct, frozen=True, kw_only=True, gc=False):
@@ -294,11 +294,11 @@ MESSAGES: Final[dict[str, type[Message]]] = {
 """Messages by the first part of their topic."""
 
 encode = msgspec.json.Encoder().encode
-"""JSON payload of a message."""
+"""Return the JSON payload of a message."""
 
 
 def withheld(verdict: Verdict, reason: Reason) -> bytes:
-    """Return the JSON of a verdict that is `unknown` for this reason, and no leave to lift."""
+    """Return the JSON of a verdict, changed to `unknown` for this reason, without leave to lift."""
     unsure = replace(verdict, verdict=Decision.UNKNOWN, verdict_code=0, reasons=[reason])
     without = replace(unsure, p_slip=None, p_slip_model=None, valid=False, judged=False)
     return encode(replace(without, supervised=False, early=False))

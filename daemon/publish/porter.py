@@ -76,7 +76,7 @@ END: Final = b"e"
 LOOP_CAME, SUBSCRIBER_CAME = b"l", b"s"
 """Bytes on stdout when the loop's own subscriber, or another subscriber, has connected."""
 ZAP_DOMAIN: Final = "graspd"
-"""libzmq asks the authenticator only if there is a domain (RFC 27)."""
+"""Domain of the `tcp://` sockets; without one libzmq asks no authenticator (RFC 27)."""
 FAILED: Final = int(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL)
 """Events of failed handshakes; the second one if the peer hangs up first."""
 EVENT: Final = struct.Struct("=HI")
@@ -96,13 +96,13 @@ class Plan(NamedTuple):
     endpoints: Sequence[str]
     """Endpoint of subscribers; a second one takes questions."""
     descriptors: Sequence[int]
-    """Their listening sockets."""
+    """Descriptor of the listening socket of each endpoint."""
     high_water_mark: int
     """Most messages that wait for one subscriber."""
     processors: Sequence[int]
     """Processors to use. The loop that starts the process may be restricted to fewer."""
     keys: Sequence[str] | None
-    """Public and secret key of the daemon for `tcp://`, Z85, and the folder of peers' keys."""
+    """Daemon's public and secret key, Z85, for `tcp://`, folder of peers' keys; None: no keys."""
 
 
 packed: Final = msgspec.msgpack.encode
@@ -143,7 +143,8 @@ class Courier(Proxy):
     def __init__(
         self, endpoint: str, front: Socket, back: Socket, admission: Admission | None
     ) -> None:
-        """`admission`: peers with keys, for a `tcp://` endpoint; None: without keys."""
+        """`front`: socket of peers. `back`: socket to the loop. `admission`: peers with keys, for
+        `tcp://`; None: without keys."""
         super().__init__(endpoint, front, back)
         self._admission = admission
 
@@ -165,7 +166,7 @@ class Courier(Proxy):
             self._front.send_multipart(unpacked(self._back.recv()), zmq.NOBLOCK)
 
     def _carry_question(self) -> bool:
-        """Carry one question, cut to `FRAMES_MAX` frames; False: none waits, or no room."""
+        """Carry one question, cut to `FRAMES_MAX` frames; False: none waits, or no room for it."""
         if not self._back.poll(0, zmq.POLLOUT) or not self._front.poll(0):
             return False
         first = self._front.recv(copy=False)
@@ -349,7 +350,7 @@ class Porter:
 
 
 def main() -> None:
-    """Serve the `Plan` in the first line of stdin until stdin ends."""
+    """Serve the `Plan` in the first line of stdin until stdin ends or `END` comes."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # only the daemon decides when to end
     logs.set_up(os.environ)

@@ -45,7 +45,7 @@ class Question:
     envelope: Frames
     """Frames before the answer's text: routing id, and the delimiter of a REQ socket."""
     due_ns: int
-    """Time of the latest answer, monotonic ns."""
+    """Latest time at which it is answered, monotonic ns."""
     lifts: bool
     """True for `lift`, False for `judge`."""
     offer: tuple[GraspId, Decision] | None = None
@@ -128,7 +128,7 @@ class Questions:
         self.waiting[peer] = question
 
     def _give_up(self, peer: Peer, reason: Reason) -> None:
-        """Answer a question with `unknown`."""
+        """Answer a question with `unknown`; before the first verdict only drop it."""
         question = self.waiting.pop(peer)
         self._withdraw(peer, question)
         self.counters["given_up"] += 1
@@ -136,7 +136,7 @@ class Questions:
             self._answer(question.envelope, withheld(self._last.verdict, reason))
 
     def _withdraw(self, peer: Peer, question: Question) -> None:
-        """Take back an offer that is not answered."""
+        """Clear the offer of a question, if it has one: the peer no longer owns that grasp."""
         offer, question.offer, question.kept = question.offer, None, None
         lifts = None if self._last is None else self._last.lifts
         if lifts is not None and offer is not None and lifts.offered(peer) == offer[0]:

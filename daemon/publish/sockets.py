@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 log = logging.getLogger("graspd")
 
 STATUS = b"status."
-"""Start of the topics that the loop also receives; `close` waits for the last of them."""
+"""Start of the topic of statuses, which the loop also receives; `close` waits for the last one."""
 ANSWERS_QUEUED: Final = 512
 """Most answers that wait for the courier: to 256 questions, and to 256 outcomes."""
 SUBSCRIBES_S: Final = 0.1
@@ -75,7 +75,7 @@ class Sockets(Companion):
         *,
         high_water_mark: int | None = None,
     ) -> None:
-        """Raises `PublishError` or `KeysError`.
+        """Open the sockets. Raises `PublishError` or `KeysError`.
 
         `clock` gives monotonic ns. `high_water_mark`: most messages that wait for a subscriber;
         None: `HIGH_WATER_MARK`.
@@ -193,11 +193,11 @@ class Door:
         high_water_mark: int = 10,
         keys: Sequence[str] | None = None,
     ) -> None:
-        """Raises `PublishError` if no process can serve the endpoints.
+        """Start the process that serves the endpoints. Raises `PublishError` if that fails.
 
         `listeners`: the first is for subscribers, an optional second one for questions.
-        `high_water_mark`: most messages that wait for one subscriber. `keys`: as in `Plan`; None:
-        `tcp://` is open to all.
+        `high_water_mark`: most messages that wait for one subscriber. `keys`: the daemon's, and the
+        folder of its peers', as in `Plan`; None: `tcp://` is open to all.
         """
         try:
             self._folder = tempfile.mkdtemp(prefix="graspd-")
