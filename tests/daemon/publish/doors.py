@@ -1,4 +1,4 @@
-"""An open door with one socket for messages, sockets of peers, and what stands for the loop."""
+"""Opened `Door` objects, sockets of peers that connect to them, and a stand-in for the loop."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ QUIET_S = 0.3
 
 Keys = tuple[bytes, bytes]
 CURVE: dict[str, object] = {"secret_key": "daemon.key_secret", "clients": "clients"}
-"""A scene with keys beside it."""
+"""Section `curve` of a scene with keys beside it."""
 
 
 USER = b"user 1000"
-"""A credential, as of `ipc://`."""
+"""Credential of a peer on an `ipc://` socket: its user id."""
 
 
 def published(
@@ -51,7 +51,10 @@ def published(
     grasp: int = 7,
     **changes: object,
 ) -> PublishedVerdict:
-    """The golden verdict of that name, with changes, on a grasp of the book."""
+    """Return the golden verdict `name` with `changes`, as if published with `payload`.
+
+    `lifts`: the book of lifts that has the `grasp`; None: an empty one.
+    """
     verdict = replace(decode_verdict((GOLDEN / f"verdict_{name}.json").read_bytes()), **changes)
     judgement = Judgement(0, verdict.verdict, (), 0.1, Moment(grasp), Opinion(0.1))
     about = GraspId("0" * 32, grasp), LiftBook() if lifts is None else lifts, keep
@@ -59,7 +62,7 @@ def published(
 
 
 class Publisher:
-    """A door that only publishes."""
+    """A `Door` with a socket for subscribers only."""
 
     def __init__(self, endpoint: str, high_water_mark: int = 1000) -> None:
         self._listener = Listener(endpoint)
@@ -84,10 +87,10 @@ class Publisher:
 
 
 class Asked:
-    """Stands for the loop: counts questions, takes outcomes, and keeps them at once."""
+    """Stand-in for the loop that counts questions and takes outcomes."""
 
     def __init__(self, reply: Callable[[Report], Reply] = lambda _report: KEPT) -> None:
-        """`reply`: what an outcome is answered."""
+        """`reply`: returns the reply to an outcome."""
         self.times = 0
         self.outcomes: list[Report] = []
         self.waiting: list[Answer] | None = None
@@ -143,7 +146,7 @@ class Peers:
 
 
 class KeyedDoor:
-    """A daemon's sockets with keys, and clients at it."""
+    """A daemon's sockets with keys, and clients that connect to them."""
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self._log = folder / "log"
@@ -179,14 +182,14 @@ class KeyedDoor:
         return load_pair(make(folder, name)[1])
 
     def admitted(self, name: str, folder: Path) -> Keys:
-        """Keys that the daemon has on its list from now on."""
+        """Make the keys of a second client; return them once the daemon has them on its list."""
         keys = self.client(name, folder)
         (folder / f"{name}.key").rename(self.clients / f"{name}.key")
         self.knows(2)
         return keys
 
     def said(self) -> str:
-        """The log of its process until now."""
+        """Return the log of the sockets' process until now."""
         return self._log.read_text()
 
     def knows(self, number: int) -> None:
@@ -194,7 +197,7 @@ class KeyedDoor:
         wait_until(lambda: re.findall(r"(\d+) keys may", self.said())[-1:] == [str(number)])
 
     def is_deaf(self, subscriber: zmq.Socket[bytes]) -> None:
-        """Wait until nothing comes there: some may be on its way."""
+        """Wait until no message comes to the subscriber. Some may still be on their way."""
         wait_until(lambda: not self.hears(subscriber, QUIET_S))
 
     def connect(
@@ -223,7 +226,7 @@ class KeyedDoor:
 
 
 def processes() -> list[int]:
-    """Processes that this one has started and not ended, such as those of doors."""
+    """Return the ids of this process's running children, such as those of `Door`."""
     folder = Path(f"/proc/{os.getpid()}/task")
     return [
         int(number)
@@ -239,7 +242,10 @@ def halt(process: int) -> None:
 
 
 def first_message(publisher: Publisher, subscriber: zmq.Socket[bytes]) -> list[bytes]:
-    """Send until something arrives: the publisher does not learn of subscriptions."""
+    """Send until a message arrives, and return its frames.
+
+    The publisher does not learn of subscriptions.
+    """
     deadline_s = time.monotonic() + WAIT_MS / 1e3
     while not subscriber.poll(10):
         assert time.monotonic() < deadline_s
@@ -250,7 +256,10 @@ def first_message(publisher: Publisher, subscriber: zmq.Socket[bytes]) -> list[b
 
 @contextmanager
 def opened_door(folder: Path, mode: int | None = None) -> Iterator[tuple[Door, str]]:
-    """A door with sockets `v` for messages and `ask` for questions; the endpoint of `ask`."""
+    """Yield a `Door` with sockets `v` for messages and `ask` for questions, and `ask`'s endpoint.
+
+    `mode`: file mode of both sockets; None: that of the process.
+    """
     listeners = [Listener(f"ipc://{folder}/{name}", mode) for name in ("v", "ask")]
     door = Door(listeners)
     yield door, listeners[1].endpoint
@@ -260,7 +269,7 @@ def opened_door(folder: Path, mode: int | None = None) -> Iterator[tuple[Door, s
 
 
 def scene_of(folder: Path, **sections: dict[str, object]) -> scene.Scene:
-    """A scene with sockets `v` and `ask` in a folder, and what else is in its sections."""
+    """Return a scene with sockets `v` and `ask` in a folder, changed by `sections`."""
     usual: dict[str, dict[str, object]] = {
         "tactile": {"driver": "replay", "recordings": ["any.csv"]},
         "publish": {"endpoint": f"ipc://{folder}/v"},
@@ -271,7 +280,7 @@ def scene_of(folder: Path, **sections: dict[str, object]) -> scene.Scene:
 
 
 def receive(door: Door, wanted: int = 1) -> list[Frames]:
-    """Questions, once there are enough."""
+    """Wait until at least `wanted` questions have come, and return them."""
     received: list[Frames] = []
 
     def have_come() -> bool:

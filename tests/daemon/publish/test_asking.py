@@ -25,7 +25,7 @@ from graspd.daemon.trust.lift_book import GraspId, LiftBook, Peer, Report
 from tests.daemon.publish.doors import Asked, published
 
 MOST = 3
-"""Questions that wait here."""
+"""Most questions that wait in this test."""
 S = 1_000_000_000
 ROBOT, STRANGER = b"user 1000", b"user 1001"
 NAME, OTHER = b"controller-16byt", b"another-16-bytes"
@@ -39,7 +39,7 @@ PEERS = [
 ANYONE = st.sampled_from((*PEERS[:1] * 3, *PEERS))
 OUTCOMES = st.sampled_from(("stable", "slip", "not-lifted"))
 Said = tuple[Frames, object]
-"""Frames before an answer, and what it says."""
+"""Frames before an answer, and its content as `plain` returns it."""
 
 
 def named(grasp: int) -> GraspId:
@@ -58,7 +58,7 @@ class Waiting:
 
 
 class Model:
-    """What a peer may rely on; the book of lifts is the daemon's, which has its own test."""
+    """Predicts the answers to peers, with the daemon's book of lifts, which has its own test."""
 
     def __init__(self, tells: Callable[[bytes], bool] | None) -> None:
         self.tells = tells
@@ -67,7 +67,7 @@ class Model:
         self.said: list[Said] = []
 
     def ask(self, peer: Peer, envelope: Frames, now_ns: int, *, lifts: bool) -> None:
-        """A connection has one question, its newest; the oldest makes place for a fifth peer's."""
+        """Keep only a connection's newest question; give up the oldest one for a fourth peer's."""
         if peer in self.waiting:
             self.withdraw(peer, self.waiting.pop(peer))
         elif len(self.waiting) == MOST:
@@ -80,13 +80,13 @@ class Model:
         self.said.append((question.envelope, ("unknown", [reason])))
 
     def withdraw(self, peer: Peer, question: Waiting) -> None:
-        """A grasp that was offered and not answered has no owner."""
+        """Take back an offer that was not answered; its grasp has no owner then."""
         offer, question.offer, question.kept = question.offer, None, None
         if offer is not None and self.book.offered(peer) == named(offer[0]):
             self.book.take_back(named(offer[0]))
 
     def verdict(self, grasp: int, name: str, now_ns: int | None, *, supervised: bool) -> None:
-        """Answer all that a verdict answers; `now_ns`: only what is due, or waits for the disk."""
+        """Answer waiting questions; `now_ns`: only those due or waiting for the disk; None: all."""
         for peer, question in list(self.waiting.items()):
             if now_ns is None or question.offer or question.due_ns <= now_ns:
                 answer = self.answer(peer, question, grasp, name, supervised=supervised)
@@ -115,7 +115,10 @@ class Model:
         return (name, owner, supervised) if question.kept else None
 
     def may_lift(self, peer: Peer) -> bool:
-        """Return True for users of the scene, else the first that lifted. Names have 16 bytes."""
+        """Return True for a user of the scene, or without any for the first that lifted.
+
+        Its routing id must have 16 bytes.
+        """
         lifter = self.book.lifter
         is_same = lifter is None or lifter.credential == peer.credential
         allowed = is_same if self.tells is None else self.tells(peer.credential)
@@ -123,7 +126,7 @@ class Model:
 
 
 class Loop(Asked):
-    """What stands for the loop: it takes outcomes if they are the peer's."""
+    """Stand-in for the loop that accepts outcomes from peers that may report them."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -143,7 +146,7 @@ def take(lifts: LiftBook, report: Report) -> bool:
 
 
 def plain(payload: bytes) -> object:
-    """The part of an answer that matters here."""
+    """Return the part of an answer that the model predicts."""
     found: dict[str, Any] = json.loads(payload)
     if "ok" in found:
         return found["ok"]
@@ -156,7 +159,7 @@ def plain(payload: bytes) -> object:
 
 
 class Questioning(RuleBasedStateMachine):
-    """Peers that ask, a hand that is judged, a disk, and the model beside them."""
+    """Peers, a hand and a disk, in any order of their actions, and the model beside them."""
 
     @initialize(tells=st.sampled_from((None, {ROBOT}.__contains__)))
     def start(self, tells: Callable[[bytes], bool] | None) -> None:
@@ -226,7 +229,10 @@ class Questioning(RuleBasedStateMachine):
         ok=st.none() | st.booleans(),
     )
     def lift(self, peer: Peer, name: str, regrasps: bool, ok: bool | None) -> None:
-        """Ask, be offered it, be answered once the disk was; maybe grasp again before that."""
+        """Ask to lift, judge, and have the disk answer `ok`; None: it does not answer.
+
+        `regrasps`: another grasp is judged before the disk answers.
+        """
         self.ask(peer, lifts=True, is_req=False)
         for is_new in (False, True)[: 1 + regrasps]:
             self.judge(name, supervised=True, is_new=is_new, is_answer=not is_new)
@@ -251,7 +257,7 @@ class Questioning(RuleBasedStateMachine):
 
     @rule(after_ns=st.sampled_from((1, S // 2, S - 1, S)))
     def wait(self, after_ns: int) -> None:
-        """No reading comes: what is due is answered `unknown` in time."""
+        """Let time pass without a reading: questions that are due are answered `unknown`."""
         self.now_ns += after_ns
         next_ns = self.questions.serve([], self.now_ns, self.loop)
         for peer, question in list(self.model.waiting.items()):

@@ -1,4 +1,4 @@
-"""What the kernel and the handshake say of who asks, and what the scene lets them do."""
+"""Credentials of peers, from the kernel or the handshake, and what the scene lets them do."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ SEVENTH = GraspId("0" * 32, 7)
 
 @pytest.fixture
 def door() -> Iterator[tuple[Door, str]]:
-    """A door that other users can reach, and its socket for questions."""
+    """A `Door` that other users can connect to, and the path of its socket for questions."""
     with tempfile.TemporaryDirectory() as folder:
         Path(folder).chmod(0o755)
         with opened_door(Path(folder), 0o666) as (opened, endpoint):

@@ -40,13 +40,13 @@ ME = b"user %d" % os.getuid()
 
 @pytest.fixture
 def asked(tmp_path: Path) -> Iterator[tuple[Door, str]]:
-    """A door with a socket for questions, and its endpoint."""
+    """A `Door` with a socket for questions, and the endpoint of this socket."""
     with opened_door(tmp_path) as opened:
         yield opened
 
 
 def endpoint_of(scheme: str, folder: Path) -> str:
-    """A place for a socket that is free."""
+    """Return a free endpoint of a scheme, one of `SCHEMES`."""
     if scheme == "ipc":
         return f"ipc://{folder}/v"
     return f"tcp://{'[::1]' if scheme == 'ip6' else '127.0.0.1'}:{free_port()}"

@@ -1,4 +1,4 @@
-"""Keys: who has none, the wrong ones, or is off the list does not get in, and that is told."""
+"""Peers without a key, with a wrong one, or off the list cannot connect, and the log says so."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def test_a_key_that_others_may_write_is_refused(tmp_path: Path, mode: int) -> No
 def test_own_keys_below_a_shared_folder_are_safe(
     tmp_path: Path,
 ) -> None:
-    """Below /tmp no user may replace another's files."""
+    """A sticky folder, such as /tmp, lets no user replace another's files."""
     keys = tmp_path / "keys"
     public, secret = make(keys, "laptop")
     tmp_path.chmod(0o1777)
@@ -224,7 +224,7 @@ def test_the_port_stays_taken_while_peers_are_disconnected(door: KeyedDoor, tmp_
 def test_keys_are_never_read_by_the_loop(
     door: KeyedDoor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A thousand keys take 60 ms, and a folder on the network may hang."""
+    """Reading a thousand keys takes 60 ms, and a folder on the network may hang."""
     read: list[str] = []
     monkeypatch.setattr(keys, "load_clients", lambda _: read.append("list"))
     monkeypatch.setattr(keys, "state", lambda _: read.append("state"))

@@ -1,4 +1,4 @@
-"""Who may publish at a path, and that nothing else there is ever lost."""
+"""Which process may publish at a path; other files there are never lost."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.daemon.publish.doors import Publisher
 
 
 def dead_socket(path: Path) -> None:
-    """What a killed daemon leaves."""
+    """Leave a socket file without a listener, as a killed daemon does."""
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind(str(path))
         listener.listen()

@@ -1,7 +1,7 @@
-"""What is lost in the middle of a grasp is `unknown` at the subscriber, and says why.
+"""A sensor or link lost in the middle of a grasp gives `unknown`, with the reason.
 
 Daemon and subscriber are real processes, the serial line and the sockets are real; only the
-hardware is a twin. Joints that are lost are in the simulated days, a daemon that is killed in
+hardware is a twin. Lost joints are tested in the simulated days, a killed daemon in
 tests/clients/test_against_daemon.py.
 """
 
@@ -24,21 +24,21 @@ from tests.daemon.processes import before_others
 from tests.threads import at_work
 
 SENSOR_MAX, LINK_MAX = 2, 0
-"""README: readings that are judged all the same: a sensor is lost with the third without it."""
+"""Most readings judged after a loss (README): the third without a sensor is `unknown`."""
 CLOCK = 1
-"""Readings that the mapping of the bridge's clock may put after the outage."""
+"""Readings before the outage that the mapping of the bridge's clock may put after it."""
 AGE_MAX_MS = 100.0
 
 
 class Twin(SpiTwin):
-    """A twin that does what it is told in its own thread."""
+    """A twin of the SPI bridge that calls functions in the thread that serves it."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, held_grasp())
         self._deeds: queue.Queue[Callable[[], object]] = queue.Queue()
 
     def work(self, stop: threading.Event) -> None:
-        """Serve until `stop`."""
+        """Serve until `stop` is set, and call the functions given to `do`."""
 
         def is_over() -> bool:
             while not self._deeds.empty():
@@ -60,7 +60,7 @@ def is_valid(verdict: Verdict) -> bool:
 
 
 def until_unknown(subscriber: Subscriber, deed: Callable[[], object], reason: Reason) -> int:
-    """Do it while a verdict stands, and wait until one is unknown for this reason.
+    """Call `deed` while verdicts are valid, and wait until one is unknown for this reason.
 
     Return how many readings after it were judged. A busy computer that stands still makes verdicts
     unknown for another reason.

@@ -1,4 +1,4 @@
-"""Questions and outcomes told: each gets one answer, and nothing that comes in hurts."""
+"""Questions and reported outcomes: each gets one answer; malformed messages do no harm."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ TELLER = b"teller"
 
 
 class Asked:
-    """Questions, and what was answered to whom."""
+    """`Questions`, and the frames of the answers that it sent."""
 
     def __init__(self) -> None:
         self.sent: list[tuple[bytes, ...]] = []
@@ -73,7 +73,7 @@ class Asked:
         return True
 
     def tell(self, peer: bytes, *frames: bytes, requests: Requests | None = None) -> dict[str, Any]:
-        """Tell an outcome, which is not a question."""
+        """Report an outcome, which is not counted as a question; return the answer."""
         requests = requests or Requests(takes_the_seventh)
         self.questions.take([[peer, USER, *frames]], 0, requests)
         assert requests.times == 0
@@ -175,7 +175,7 @@ def test_a_repeated_outcome_is_answered_as_taken_and_repeated(asked: Asked) -> N
 
 
 NO_NAMES = ("=HYPERLINK(0)", "-1", "+1", "@SUM(1)", "..", ".mug", "a/b", "a;b", "a=1", "a|b", "~")
-"""What a spreadsheet or a shell takes for more than a name."""
+"""Refused names of objects, which a spreadsheet or a shell could read as more than a name."""
 
 
 @pytest.mark.parametrize("name", [None, "mug", "035_power-drill", "_.-", "x" * 64, "Z"])

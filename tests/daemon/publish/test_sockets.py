@@ -142,7 +142,7 @@ def test_an_unknown_group_is_said(tmp_path: Path) -> None:
 
 
 def junk(rng: random.Random) -> list[bytes]:
-    """Subscriptions, questions and what is neither; of any length, of up to five frames."""
+    """Return a message of up to four random frames: a subscription, a question, or neither."""
     kind = rng.randrange(6)
     if kind == 0:
         return [bytes([rng.randrange(3)]) + rng.randbytes(rng.randrange(200))]

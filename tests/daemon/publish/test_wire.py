@@ -27,7 +27,7 @@ from tests.kit.messages import GOLDEN, decode_verdict, golden
 
 SCHEMA_FILE = Path(__file__).parents[3] / "deploy" / "wire" / "messages.schema.json"
 NAMES = sorted(path.stem for path in GOLDEN.glob("*.json"))
-"""Each begins with the kind of the message."""
+"""Names of the golden messages, which begin with the kind of the message."""
 
 
 @pytest.mark.parametrize(
@@ -106,7 +106,8 @@ def test_a_message_that_breaks_the_schema_is_refused_by_both(change: dict[str, A
 
 
 def fields_of(page: str, heading: str) -> set[str]:
-    """Return the names before the colons of a section's list, and those that its text names."""
+    """Return the names in backticks before the colons of a section's list, and in its lines that
+    begin with one."""
     section = page.partition(f"{heading}\n")[2].partition("\n## ")[0]
     heads = re.findall(r"^- (`[^:]*`):|^(`.*)$", section, re.MULTILINE)
     return {name for head in heads for name in re.findall(r"`(\w+)`", "".join(head))}
