@@ -273,7 +273,9 @@ class Questioning(RuleBasedStateMachine):
         assert self.loop.lifts.lifter == self.model.book.lifter
 
 
-def test_questions_in_any_order_are_answered_as_the_model(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_questions_in_any_order_are_answered_as_the_model_predicts(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr("graspd.daemon.publish.questions.WAITING_MAX", MOST)
     run_state_machine_as_test(
         Questioning, settings=settings(derandomize=True, max_examples=100, stateful_step_count=40)

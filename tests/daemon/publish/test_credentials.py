@@ -71,7 +71,9 @@ def hello(*properties: tuple[bytes, bytes]) -> bytes:
 
 
 @pytest.mark.parametrize("forged", [b"Peer-Address", b"User-Id"])
-def test_a_peer_cannot_name_its_own_user(door: tuple[Door, str], forged: bytes) -> None:
+def test_a_peer_cannot_forge_its_user_by_handshake_properties(
+    door: tuple[Door, str], forged: bytes
+) -> None:
     with socket.socket(socket.AF_UNIX) as rogue:
         rogue.connect(door[1])
         rogue.sendall(GREETING)
@@ -108,12 +110,14 @@ def may_lift(sockets: Sockets, credential: bytes) -> bool:
     ("credential", "may"),
     [(b"user 12345", True), (b"user 0", True), (b"user 1", False), (b"", False), (b"key x", False)],
 )
-def test_tellers_are_users_of_the_scene(tmp_path: Path, credential: bytes, may: bool) -> None:
+def test_only_users_named_in_ask_tell_may_lift(
+    tmp_path: Path, credential: bytes, may: bool
+) -> None:
     with Sockets(scene_of(tmp_path, ask={"tell": ["root", "12345"]})) as sockets:
         assert may_lift(sockets, credential) is may
 
 
-def test_tellers_are_keys_of_the_scene(tmp_path: Path) -> None:
+def test_only_keys_named_in_ask_tell_may_lift(tmp_path: Path) -> None:
     make(tmp_path, "daemon")
     public = load_pair(make(tmp_path / "clients", "controller")[1])[0]
     make(tmp_path / "clients", "dashboard")
@@ -125,17 +129,19 @@ def test_tellers_are_keys_of_the_scene(tmp_path: Path) -> None:
             assert not may_lift(sockets, other)
 
 
-def test_a_teller_that_is_not_a_user_is_refused(tmp_path: Path) -> None:
+def test_an_unknown_user_in_ask_tell_is_refused(tmp_path: Path) -> None:
     with pytest.raises(PublishError, match="there is no user no-such-user"):
         Sockets(scene_of(tmp_path, ask={"tell": ["no-such-user"]}))
 
 
-def test_tellers_cannot_be_checked_on_plain_tcp(tmp_path: Path) -> None:
+def test_ask_tell_on_tcp_without_keys_is_refused(tmp_path: Path) -> None:
     with pytest.raises(scene.SceneError, match=r"ask\.tell needs an ipc:// socket"):
         scene_of(tmp_path, ask={"endpoint": "tcp://127.0.0.1:5555", "tell": ["root"]})
 
 
-def test_a_killed_daemon_takes_the_outcome_after_its_restart(tmp_path: Path, peers: Peers) -> None:
+def test_after_a_restart_only_the_asker_may_report_the_outcome(
+    tmp_path: Path, peers: Peers
+) -> None:
     session = '[session]\nkeep = true\nfolder = "s"\n'
     with Daemon(tmp_path, session, recording=DEMO_RECORDING) as daemon:
         asker = peers.connect(zmq.DEALER, daemon.ask_endpoint, name=NAME)

@@ -62,7 +62,7 @@ def has_ipv6() -> bool:
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_a_plain_subscriber_gets_two_frames_in_order(
+def test_a_subscriber_gets_messages_of_two_frames_in_order(
     tmp_path: Path, peers: Peers, scheme: str
 ) -> None:
     if scheme == "ip6" and not has_ipv6():
@@ -88,7 +88,7 @@ def test_a_signal_ends_the_wait_for_a_subscriber(tmp_path: Path, number: signal.
         assert stop.received is number
 
 
-def test_messages_that_its_process_is_too_slow_for_are_dropped(tmp_path: Path) -> None:
+def test_messages_are_dropped_while_the_socket_process_is_stopped(tmp_path: Path) -> None:
     with Publisher(f"ipc://{tmp_path}/v", high_water_mark=5) as publisher:
         (process,) = processes()
         halt(process)
@@ -99,7 +99,7 @@ def test_messages_that_its_process_is_too_slow_for_are_dropped(tmp_path: Path) -
     assert not all(sent)
 
 
-def test_a_subscriber_that_does_not_read_loses_only_messages(tmp_path: Path, peers: Peers) -> None:
+def test_a_slow_subscriber_loses_messages_but_not_their_order(tmp_path: Path, peers: Peers) -> None:
     endpoint = f"ipc://{tmp_path}/v"
     with Publisher(endpoint, high_water_mark=10) as publisher:
         subscriber = peers.subscribe(endpoint, high_water_mark=10)
@@ -128,13 +128,13 @@ def test_all_messages_before_the_last_status_arrive(tmp_path: Path, peers: Peers
     assert heard[-501:-1] == [[b"verdict.right", b"%d" % number] for number in range(500)]
 
 
-def test_a_door_on_a_port_that_is_taken_is_refused(tmp_path: Path) -> None:
+def test_a_second_publisher_on_a_taken_port_is_refused(tmp_path: Path) -> None:
     endpoint = endpoint_of("tcp", tmp_path)
     with Publisher(endpoint), pytest.raises(PublishError, match="in use"):
         Publisher(endpoint)
 
 
-def test_answers_go_by_the_routing_id_that_reconnects(
+def test_answers_reach_the_newest_connection_of_a_routing_id(
     asked: tuple[Door, str], peers: Peers
 ) -> None:
     door, endpoint = asked
@@ -167,7 +167,9 @@ def test_a_flood_of_questions_is_read_a_few_a_round(asked: tuple[Door, str], pee
     assert max(rounds) <= QUESTIONS_MAX
 
 
-def test_only_a_peer_that_floods_is_disconnected(asked: tuple[Door, str], peers: Peers) -> None:
+def test_an_oversized_message_is_dropped_and_other_peers_are_served(
+    asked: tuple[Door, str], peers: Peers
+) -> None:
     door, endpoint = asked
     loud, polite = (peers.connect(zmq.DEALER, endpoint, name=name) for name in (b"loud", b"polite"))
     loud.send(b"x" * 100_000)
@@ -175,7 +177,7 @@ def test_only_a_peer_that_floods_is_disconnected(asked: tuple[Door, str], peers:
     assert receive(door, 1) == [[b"polite", ME, b"judge"]]
 
 
-def test_peers_reconnect_after_the_end_of_its_process(
+def test_peers_reconnect_after_the_socket_process_was_killed(
     asked: tuple[Door, str], tmp_path: Path, peers: Peers
 ) -> None:
     door, endpoint = asked
@@ -196,7 +198,7 @@ def test_peers_reconnect_after_the_end_of_its_process(
         os.kill(process, signal.SIGKILL)
 
 
-def test_the_process_ends_with_the_daemon_and_leaves_no_file(tmp_path: Path) -> None:
+def test_the_socket_process_cleans_up_and_ends_with_the_daemon(tmp_path: Path) -> None:
     code = (
         "import os, sys; from graspd.daemon.publish.sockets import Door;"
         "from graspd.daemon.publish.listener import Listener;"
@@ -223,7 +225,7 @@ def test_connections_take_no_descriptor_of_the_daemon(tmp_path: Path) -> None:
         assert len(os.listdir("/proc/self/fd")) == before + 50  # the other ends
 
 
-def test_the_process_ends_when_a_thread_of_it_has_ended(tmp_path: Path) -> None:
+def test_the_socket_process_ends_when_one_of_its_threads_ends(tmp_path: Path) -> None:
     with contextlib.closing(Listener(f"ipc://{tmp_path}/v")) as listener:
         plan = Plan(str(tmp_path), [listener.endpoint], [listener.fileno()], 10, [0], None)
         code = "import zmq; from graspd.daemon.publish import porter;"

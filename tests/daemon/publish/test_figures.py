@@ -48,7 +48,7 @@ def test_extreme_durations_stay_in_the_histogram() -> None:
     ],
     ids=["distance from the period", "lost reading", "outage"],
 )
-def test_jitter_is_of_readings_in_a_row(
+def test_jitter_leaves_out_lost_readings_and_outages(
     times_ms: dict[int, int], counted: int, longest_us: float
 ) -> None:
     deadlines = Deadlines()
@@ -59,7 +59,7 @@ def test_jitter_is_of_readings_in_a_row(
 
 
 @pytest.mark.parametrize(("period_ns", "late", "counted"), [(PERIOD_NS, 1, 3), (None, 0, 0)])
-def test_a_verdict_a_period_after_its_reading_is_late(
+def test_a_verdict_older_than_a_period_is_late(
     period_ns: int | None, late: int, counted: int
 ) -> None:
     deadlines = Deadlines()
@@ -99,7 +99,7 @@ def test_scores_follow_their_definitions_with_slip_positive() -> None:
 
 
 @pytest.mark.parametrize(("slipped", "scores"), [(None, None), (False, {"accuracy": 1.0})])
-def test_a_score_without_lifts_of_its_kind_is_left_out(
+def test_scores_that_cannot_be_computed_are_left_out(
     slipped: bool | None, scores: dict[str, float] | None
 ) -> None:
     summary = RunSummary()
@@ -108,7 +108,7 @@ def test_a_score_without_lifts_of_its_kind_is_left_out(
     assert any("recorded" in line for line in summary.lines(1.0, None)) is (scores is not None)
 
 
-def test_what_stable_is_worth_counts_each_lift_of_known_outcome() -> None:
+def test_figures_of_stable_verdicts_match_a_count_by_hand() -> None:
     tally = Tally()
     cases = [
         (Decision.STABLE, False, 60),
@@ -135,7 +135,7 @@ def test_what_stable_is_worth_counts_each_lift_of_known_outcome() -> None:
     )
 
 
-def test_a_late_outcome_counts_as_if_recorded() -> None:
+def test_an_outcome_reported_later_counts_like_a_recorded_one() -> None:
     early, late = RunSummary(), RunSummary()
     for grasp, slipped in enumerate((True, False, True, False), 1):
         said = verdict(Decision.STABLE if grasp < 3 else Decision.SLIP)
@@ -149,7 +149,7 @@ def test_a_late_outcome_counts_as_if_recorded() -> None:
     assert late.tally.as_dict() == early.tally.as_dict()
 
 
-def test_a_grasp_of_another_start_is_another_grasp() -> None:
+def test_equal_grasp_numbers_of_two_starts_are_two_grasps() -> None:
     summary = RunSummary()
     for boot in "ab":
         said = verdict(Decision.STABLE)

@@ -30,7 +30,7 @@ def door(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[KeyedDoor]
     door.close()
 
 
-def test_a_key_on_the_list_hears_messages_and_may_ask(door: KeyedDoor) -> None:
+def test_a_peer_with_a_listed_key_gets_messages_and_answers(door: KeyedDoor) -> None:
     assert door.hears(door.connect(door.known), PATIENCE_S)
     asker = door.connect(door.known, zmq.REQ)
     asker.send(b"judge")
@@ -49,7 +49,7 @@ def test_a_key_on_the_list_hears_messages_and_may_ask(door: KeyedDoor) -> None:
     assert door.said().count("admitted a peer with the key of controller") == 2
 
 
-def test_an_unlisted_key_is_refused_and_named(door: KeyedDoor, tmp_path: Path) -> None:
+def test_an_unlisted_key_is_refused_and_logged(door: KeyedDoor, tmp_path: Path) -> None:
     keys = door.client("stranger", tmp_path / "elsewhere")
     assert not door.hears(door.connect(keys), QUIET_S)
     told = f"turned away a peer: its key {keys[0].decode()} is not on the list"
@@ -57,7 +57,7 @@ def test_an_unlisted_key_is_refused_and_named(door: KeyedDoor, tmp_path: Path) -
     assert door.hears(door.connect(door.known), PATIENCE_S)
 
 
-def test_a_peer_without_a_key_is_warned_of(door: KeyedDoor) -> None:
+def test_a_peer_without_a_key_is_refused_with_a_warning(door: KeyedDoor) -> None:
     for kind in (zmq.SUB, zmq.SUB, zmq.DEALER):
         assert not door.hears(door.connect(None, kind), QUIET_S)
     # A peer that sees what the daemon wants may hang up before it has said that it has no key.
@@ -66,7 +66,9 @@ def test_a_peer_without_a_key_is_warned_of(door: KeyedDoor) -> None:
     assert door.hears(door.connect(door.known), PATIENCE_S)
 
 
-def test_a_removed_key_counts_whatever_lies_beside_it(door: KeyedDoor, tmp_path: Path) -> None:
+def test_removing_a_key_disconnects_its_peer_despite_a_broken_file(
+    door: KeyedDoor, tmp_path: Path
+) -> None:
     friend = door.admitted("friend", tmp_path / "friends")
     (door.clients / "new.key").symlink_to("nowhere")
     wait_until(lambda: "new.key: " in door.said())
@@ -83,7 +85,7 @@ def test_a_removed_key_counts_whatever_lies_beside_it(door: KeyedDoor, tmp_path:
     door.is_deaf(door.connect(friend))
 
 
-def test_an_untrusted_folder_admits_no_key(door: KeyedDoor) -> None:
+def test_a_folder_that_others_may_write_admits_no_key(door: KeyedDoor) -> None:
     former = door.connect(door.known)
     assert door.hears(former, PATIENCE_S)
     door.clients.chmod(0o770)
@@ -115,7 +117,7 @@ NO_KEYS: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.mark.parametrize("kind", NO_KEYS)
-def test_a_file_without_a_key_is_named(tmp_path: Path, kind: str) -> None:
+def test_a_broken_key_file_is_named_and_others_are_admitted(tmp_path: Path, kind: str) -> None:
     NO_KEYS[kind](tmp_path / "broken.key")
     make(tmp_path, "laptop")
     admitted, refused = load_clients(tmp_path)
@@ -135,7 +137,7 @@ def test_a_key_that_others_may_write_is_refused(tmp_path: Path, mode: int) -> No
         load_own(secret)
 
 
-def test_own_keys_below_a_shared_folder_are_safe(
+def test_keys_below_a_shared_folder_need_its_sticky_bit(
     tmp_path: Path,
 ) -> None:
     """A sticky folder, such as /tmp, lets no user replace another's files."""
@@ -164,14 +166,14 @@ def test_keys_of_another_user_are_refused(tmp_path: Path, which: str) -> None:
     assert why == f"{keys / which}: belongs to 12345, who may put another key there"
 
 
-def test_links_that_lead_round_and_round_are_followed_no_further(tmp_path: Path) -> None:
+def test_a_cycle_of_symbolic_links_is_refused(tmp_path: Path) -> None:
     (tmp_path / "one").symlink_to("two")
     (tmp_path / "two").symlink_to("one")
     with pytest.raises(KeysError, match="Too many levels"):
         load_clients(tmp_path / "one" / "clients")
 
 
-def test_keys_are_told_apart_and_never_overwritten(tmp_path: Path) -> None:
+def test_a_public_key_alone_and_a_taken_name_are_refused(tmp_path: Path) -> None:
     public, secret = make(tmp_path, "daemon")
     with pytest.raises(KeysError, match="has no secret key"):
         load_pair(public)
@@ -183,7 +185,7 @@ def test_keys_are_told_apart_and_never_overwritten(tmp_path: Path) -> None:
         make(tmp_path, "../daemon")
 
 
-def test_the_command_makes_lists_and_complains(tmp_path: Path) -> None:
+def test_the_keys_command_makes_and_lists_keys_and_checks_rights(tmp_path: Path) -> None:
     assert graspd("keys", "make", "daemon", "--dir", tmp_path).returncode == 0
     assert stat.S_IMODE(os.stat(tmp_path / "daemon.key_secret").st_mode) == 0o600
     (tmp_path / "clients").mkdir()
@@ -199,7 +201,7 @@ def test_the_command_makes_lists_and_complains(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("command", ["check", "run"])
-def test_a_folder_that_others_write_is_refused_at_start(tmp_path: Path, command: str) -> None:
+def test_check_and_run_refuse_keys_that_others_may_replace(tmp_path: Path, command: str) -> None:
     make(tmp_path / "keys", "daemon")
     make(tmp_path / "keys" / "clients", "laptop")
     curve = '[curve]\nsecret_key = "keys/daemon.key_secret"\nclients = "keys/clients"\n'
@@ -210,7 +212,9 @@ def test_a_folder_that_others_write_is_refused_at_start(tmp_path: Path, command:
     assert f"{tmp_path}/keys: mode 0777; others may write it" in done.stderr
 
 
-def test_the_port_stays_taken_while_peers_are_disconnected(door: KeyedDoor, tmp_path: Path) -> None:
+def test_the_port_stays_taken_while_the_socket_process_restarts(
+    door: KeyedDoor, tmp_path: Path
+) -> None:
     door.admitted("friend", tmp_path / "friends")
     (door.clients / "friend.key").unlink()
     door.knows(1)

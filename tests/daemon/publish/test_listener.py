@@ -38,7 +38,7 @@ OTHERS: dict[str, Callable[[Path], object]] = {
 
 @pytest.mark.parametrize("kind", OTHERS)
 @pytest.mark.parametrize("name", ["v", "v.lock"])
-def test_other_things_at_its_path_are_left_as_they_are(
+def test_a_foreign_file_at_the_path_is_refused_and_kept(
     tmp_path: Path, name: str, kind: str
 ) -> None:
     path = tmp_path / name
@@ -84,7 +84,7 @@ def test_a_socket_left_by_a_killed_daemon_is_taken_over(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["file", "socket"])
-def test_closing_leaves_what_was_put_there_meanwhile(tmp_path: Path, kind: str) -> None:
+def test_closing_keeps_a_file_that_replaced_the_socket(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "v"
     with Publisher(f"ipc://{path}"):
         path.unlink()
@@ -105,7 +105,7 @@ def test_closing_leaves_what_was_put_there_meanwhile(tmp_path: Path, kind: str) 
         ("/proc/graspd", r"cannot publish on ipc:///proc/graspd: \w"),  # not even root may
     ],
 )
-def test_a_path_where_no_socket_can_be_is_one_line(tmp_path: Path, path: str, says: str) -> None:
+def test_an_unusable_path_is_refused_with_one_line(tmp_path: Path, path: str, says: str) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(PublishError, match=says) as error:
         Publisher(f"ipc://{tmp_path / path}")

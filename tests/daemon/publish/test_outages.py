@@ -79,7 +79,7 @@ def until_unknown(subscriber: Subscriber, deed: Callable[[], object], reason: Re
     return len(judged)
 
 
-def test_peers_that_hang_up_end_no_daemon(tmp_path: Path) -> None:
+def test_peers_that_hang_up_do_not_end_the_daemon(tmp_path: Path) -> None:
     with hand(tmp_path) as daemon:
         for door in daemon.doors:
             for says in HANG_UPS:
@@ -89,7 +89,7 @@ def test_peers_that_hang_up_end_no_daemon(tmp_path: Path) -> None:
         assert daemon.process.poll() is None
 
 
-def test_every_outage_is_unknown_and_says_why(tmp_path: Path) -> None:
+def test_a_lost_sensor_or_link_is_unknown_with_its_reason(tmp_path: Path) -> None:
     sections = spi_section(tmp_path) + '[model]\nname = "cnn1"\n'
     with (
         before_others(),

@@ -49,7 +49,7 @@ def test_outcomes_are_published_as_the_schema_says() -> None:
         jsonschema.validate(json.loads(payload), schema() | {"$ref": "#/$defs/OutcomeMessage"})
 
 
-def test_an_outcome_of_an_earlier_start_names_it() -> None:
+def test_an_outcome_of_an_earlier_start_names_that_start() -> None:
     output = SentMessages()
     sender = outbox(output)
     for boot_id, judged_by in ((BOOT, None), ("f" * 32, "f" * 32)):
@@ -91,7 +91,7 @@ def asked() -> Asked:
     return Asked()
 
 
-def test_the_daemons_clock_is_told_at_once_and_judges_nothing(asked: Asked) -> None:
+def test_a_clock_question_is_answered_at_once_without_a_judgement(asked: Asked) -> None:
     requests = Requests()
     asked.questions.take([[b"asker", USER, b"clock"]], 1_234_567_890_123, requests)
     assert asked.sent == [(b"asker", b'{"v":1,"t_mono_ns":1234567890123}')]
@@ -124,7 +124,7 @@ def test_other_frames_than_questions_are_counted_and_not_answered(
     assert asked.questions.counters["malformed"] == 1
 
 
-def test_before_the_first_reading_silence_is_the_answer(
+def test_a_question_due_before_the_first_reading_publishes_silence(
     asked: Asked, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     requests, silences = Requests(), list[bool]()
@@ -148,7 +148,7 @@ def test_an_outcome_is_answered_at_once(asked: Asked) -> None:
     assert asked.questions.counters["malformed"] == 0
 
 
-def test_an_outcome_to_be_kept_is_answered_when_kept(asked: Asked) -> None:
+def test_an_accepted_outcome_is_answered_once_the_disk_has_replied(asked: Asked) -> None:
     requests = Requests(takes_the_seventh)
     waiting: list[Answer] = []
     requests.waiting = waiting
@@ -179,7 +179,7 @@ NO_NAMES = ("=HYPERLINK(0)", "-1", "+1", "@SUM(1)", "..", ".mug", "a/b", "a;b", 
 
 
 @pytest.mark.parametrize("name", [None, "mug", "035_power-drill", "_.-", "x" * 64, "Z"])
-def test_the_object_arrives_as_it_was_told(asked: Asked, name: str | None) -> None:
+def test_the_loop_gets_the_object_name_as_reported(asked: Asked, name: str | None) -> None:
     requests = Requests()
     text = f"outcome {BOOT} 7 slip" + (f" {name}" if name else "")
     answer = asked.tell(TELLER, text.encode(), requests=requests)
@@ -214,7 +214,7 @@ def test_an_outcome_that_is_malformed_is_answered_and_counted(asked: Asked, text
 
 
 @given(st.lists(st.binary(max_size=200), min_size=1, max_size=20))
-def test_all_texts_after_the_word_get_an_answer(texts: list[bytes]) -> None:
+def test_any_text_after_the_word_outcome_gets_an_answer(texts: list[bytes]) -> None:
     asked = Asked()
     for text in texts:
         answer = asked.tell(TELLER, b"outcome " + text, requests=Requests())

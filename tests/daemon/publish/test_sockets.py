@@ -41,7 +41,7 @@ def test_readings_are_published_at_the_rate_of_the_scene(
     assert times == pytest.approx(10 * published, abs=1)
 
 
-def test_readings_after_a_pause_catch_up_nothing(tmp_path: Path) -> None:
+def test_after_a_pause_only_one_reading_is_due(tmp_path: Path) -> None:
     clock = Clock()
     with Sockets(scene_of(tmp_path, publish={"tactile_hz": 10.0}), clock) as sockets:
         assert sockets.wanted(b"tactile.right")
@@ -84,7 +84,7 @@ def test_the_descriptor_is_ready_when_a_question_has_come(tmp_path: Path, peers:
             sockets.before_wait(requests)
 
 
-def test_subscribers_that_hear_late_are_in_the_health(tmp_path: Path) -> None:
+def test_the_health_says_when_subscribers_get_messages_late(tmp_path: Path) -> None:
     with Sockets(scene_of(tmp_path)) as sockets:
         assert sockets.health == {}
         (process,) = processes()
@@ -101,7 +101,7 @@ def test_subscribers_that_hear_late_are_in_the_health(tmp_path: Path) -> None:
         assert sockets.health == {}
 
 
-def test_sockets_that_are_closed_drop_what_is_sent_and_answered(tmp_path: Path) -> None:
+def test_closed_sockets_count_messages_and_answers_as_dropped(tmp_path: Path) -> None:
     sockets = Sockets(scene_of(tmp_path))
     assert sockets.questions is not None
     sockets.questions.take([[b"asker", USER, b"judge"]], 0, Asked())
@@ -135,7 +135,7 @@ def test_only_owner_and_group_may_ask(tmp_path: Path, publish: str | None, mode:
         os.umask(former)
 
 
-def test_an_unknown_group_is_said(tmp_path: Path) -> None:
+def test_an_unknown_group_is_refused_and_leaves_no_file(tmp_path: Path) -> None:
     with pytest.raises(PublishError, match="no group no-such-group"):
         Sockets(scene_of(tmp_path, publish={"group": "no-such-group"}))
     assert list(tmp_path.iterdir()) == []

@@ -53,7 +53,7 @@ def test_a_message_without_fields_added_later_is_still_read(name: str, added: st
     "name",
     ["", "a mug", "mug,cup", 'the "mug"', "mug's", "x" * 65, "m\u00fcg", "mug\n", "=1", "-", "a/b"],
 )
-def test_a_malformed_object_is_not_an_outcome(name: str) -> None:
+def test_an_outcome_with_a_malformed_object_name_is_refused(name: str) -> None:
     content = json.loads((GOLDEN / "outcome.json").read_text()) | {"object": name}
     with pytest.raises(msgspec.DecodeError):
         decode_outcome(json.dumps(content).encode())
@@ -95,7 +95,7 @@ def test_a_probability_that_is_not_a_number_becomes_null() -> None:
         {"verdict_code": 3},
     ],
 )
-def test_a_message_that_breaks_the_schema_is_refused_by_both(change: dict[str, Any]) -> None:
+def test_a_malformed_verdict_fails_decoding_and_schema_validation(change: dict[str, Any]) -> None:
     content = json.loads((GOLDEN / "verdict_stable.json").read_text()) | change
     with pytest.raises(msgspec.ValidationError):
         decode_verdict(json.dumps(content).encode())
