@@ -55,7 +55,8 @@ class Export:
     """Grasps with an outcome."""
 
     def take(self, message: RecordedMessage) -> None:
-        """Add a message. Raises `ValueError` or `OverflowError` for a malformed one."""
+        """Add judged counts or an outcome; ignore other messages. Raises `ValueError` or
+        `OverflowError` for a malformed one."""
         if message.kind == Topic.JUDGED:
             judgement = decode_judged(message.payload)
             self.judged[GraspId(judgement.boot_id, judgement.grasp)] = judgement
@@ -86,7 +87,8 @@ class Export:
 def collect(paths: Sequence[Path]) -> Export:
     """Return the grasps of recordings. `paths`: in the order of time.
 
-    Raises `RecordingError` for a file that is damaged or of other fingers.
+    Raises `RecordingError` for other files, other fingers, or malformed messages; a damaged file is
+    read up to the damage.
     """
     export = Export()
     for path in paths:

@@ -31,8 +31,8 @@ def read_grasps(path: str | os.PathLike[str], *, read_as: ReadAs | None = None) 
     """Return grasps with known outcome: columns `object`, `slipped` and, finger by finger, counts.
 
     `path`: a grasp table, or a recording (MCAP); `-` is standard input. Pass `read_as="table"`
-    for a table in which many rows repeat each other. Grasps without an outcome are left out, with a
-    warning that counts them. Raises `RecordingError`.
+    for a table in which many rows repeat each other. Grasps without an outcome are left out; those
+    of a table are counted in a warning. Raises `RecordingError`.
     """
     with files_of([Path(path)]) as (file,):
         return _grasps(file, read_as)
@@ -121,7 +121,7 @@ def _readings(path: Path, read_as: ReadAs | None, rate_hz: float | None) -> pd.D
 
 
 def grasps_of(export: Export, object_name: str) -> pd.DataFrame:
-    """Return the grasps of an export; `object_name` is for grasps without one."""
+    """Return an export as `read_grasps` does a table; `object_name`: for grasps without one."""
     grasps = list(export.grasps.values())
     labels = {
         OBJECT: [object_name if each.object_name is None else each.object_name for each in grasps],

@@ -44,7 +44,7 @@ class LiveServer:
         return int(self._server.port)
 
     def send(self, topic: bytes, payload: bytes) -> None:
-        """Pass on a published message; ignore other topics."""
+        """Pass on a published message; ignore one of an unknown topic, or malformed."""
         kind, _, hand = topic.decode(errors="replace").partition(".")
         if kind not in schemas():
             return

@@ -65,7 +65,7 @@ class RecordingHeader(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def of(cls, texts: Mapping[str, str]) -> Self:
-        """Return the header in `texts`, without which defaults apply. Raises `ValueError`."""
+        """Return the header in `texts`. Raises `ValueError`, as for a missing required field."""
         known = texts.keys() & cls.__struct_fields__
         fields: dict[str, Any] = {name: texts[name] for name in known}
         for name in known.difference(_TEXTS):

@@ -248,7 +248,7 @@ class McapReader:
         self._stream = packed
 
     def _merged(self, parts: list[_Part], offset_ns: int) -> Iterator[RecordedMessage]:
-        """Yield the messages of parts, the oldest part last, in the order of time."""
+        """Yield the messages of `parts`, by time. `parts`: the oldest last; the list is emptied."""
         opened: list[tuple[int, int, _Content]] = []
         now_ns = 0
         try:
@@ -359,7 +359,7 @@ def _note(channel: Channel, kinds: dict[int, str]) -> None:
 
 
 def _unpack(compression: str, content: bytes, max_bytes: int) -> bytes | None:
-    """Return at most `max_bytes` of an unpacked chunk; None if its window is larger."""
+    """Return up to `max_bytes` of an unpacked chunk; None if zstd needs over `CHUNK_MAX_BYTES`."""
     unpacked = content
     if compression == "zstd":
         if zstandard.get_frame_parameters(content).window_size > CHUNK_MAX_BYTES:

@@ -59,7 +59,7 @@ class McapReplayDriver(ReadingsDriver[_Item]):
     """
 
     on_event: Callable[[RecordedEvent], None] | None = None
-    """Called with each event that changes the judge's state."""
+    """Called with each recorded event; those about a reading come before it. None: not called."""
 
     def reset(self) -> None:
         super().reset()

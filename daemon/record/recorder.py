@@ -83,7 +83,7 @@ class _Open:
 
 
 class Recorder(Companion):
-    """Records one run of the daemon. Methods never raise; they block for at most `patience_s`."""
+    """Records one run of the daemon. Methods never raise, and only `close` waits for the disk."""
 
     def __init__(
         self,
@@ -100,8 +100,8 @@ class Recorder(Companion):
         """Start the thread, which creates the first file.
 
         `take_header`: copies session and learning for a file's header. It is called here and after
-        a status, when no reading is being judged. `patience_s`: how long `close` and a run that
-        plays recordings wait for a slow disk.
+        a status, when no reading is being judged. `patience_s`: longest wait for a slow disk in
+        `close` (at least `CLOSE_S`) and in `ReplayRecorder`.
         """
         self._options = options
         self._hand = hand
@@ -236,7 +236,7 @@ class Recorder(Companion):
             self._awaits_turn = self._wants_turn = True
 
     def _take_turn(self, make_header: MakeHeader, now_ns: int) -> None:
-        """Begin new files, unless `close` was called."""
+        """Begin new files, unless `close` was called while files are open."""
         self._awaits_turn = False
         if self._open is None or not self._stopping.is_set():
             self._finish()
@@ -353,7 +353,7 @@ class ReplayRecorder(Recorder):
         super()._put(topic, content, at_ns)
 
     def on_verdict(self, published: PublishedVerdict) -> None:
-        """Record a verdict, and wait for the disk before the next reading is played."""
+        """Record a verdict's late mark and counts; if the queue is half full, wait for the disk."""
         super().on_verdict(published)
         self._taken.clear()
         is_full = len(self._queue) >= QUEUE_MAX // 2

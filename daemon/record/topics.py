@@ -163,7 +163,7 @@ _decode = msgspec.json.Decoder(dict[str, Any]).decode
 
 @cache
 def schemas() -> dict[str, tuple[str, bytes]]:
-    """Return name and JSON Schema by topic. Viewers know the names that begin with `foxglove`."""
+    """Return name and JSON Schema by first part of topic. Viewers know names in `foxglove`."""
     described = {}
     for topic, message in MESSAGES.items():
         family = "foxglove" if message in (RawImage, Log) else "graspd"
@@ -180,9 +180,9 @@ def decode_judged(payload: bytes) -> Judged:
 
 
 def tactile_reading(payload: bytes, fingers: Sequence[str]) -> TactileReading:
-    """Return the reading of a `tactile` message with `fingers`.
+    """Return the reading of a `tactile` message, with rows in the order of `fingers`.
 
-    Raises `ValueError` or `OverflowError`.
+    Raises `ValueError`, also if one is missing, or `OverflowError`.
     """
     content = _decode(payload)
     content["counts"] = table(content.get("counts"))
@@ -293,7 +293,7 @@ def _object(kind: inspect.StructType) -> JsonSchema:
 
 
 def _values(kind: inspect.Type) -> list[Any]:
-    """Return the values of an enumeration or a literal, in order."""
+    """Return the values of an enumeration or a literal, in order; [] for other types."""
     if isinstance(kind, inspect.EnumType):
         return [member.value for member in kind.cls]
     return list(kind.values) if isinstance(kind, inspect.LiteralType) else []

@@ -27,7 +27,7 @@ from graspd.models.levels import FULL, HEIGHT, PIXELS, WIDTH, RestCounts, fall_o
 INFO: Final = 2
 WARNING: Final = 3
 SCALE: Final = 4
-"""Width and height of a pixel of the tactile image, in pixels of the drawn one."""
+"""Factor by which the drawn image is wider and higher than the tactile one."""
 _COLOURS: Final = {
     -100: (59, 125, 216),
     0: (38, 44, 54),
