@@ -1,4 +1,4 @@
-"""A daemon that records while a controller tells it how its lifts ended, as processes."""
+"""A recorder in a folder, and the messages of the recordings that it writes."""
 
 from __future__ import annotations
 
@@ -21,23 +21,22 @@ HEADER = RecordingHeader(
     fingers=("ff", "th"), joints=True, boot_id=BOOT, scene={}, model="any", model_sha256=""
 )
 NO_STATUS = cast(Status, None)
-"""A recorder gets the status as a message."""
+"""Status that a recorder is called with and ignores; it records the message of the status."""
 
 IGNORED_FIELDS = frozenset(
     {"boot_id", "seq", "t", "t_mono_ns", "age_ms", "latency_us", "silence_ms"}
 )
-"""Fields of a verdict that are of the run and not of the readings: a recording that is played again
-gives all others bit for bit."""
+"""Fields of a verdict that depend on the run, not the readings; a replay repeats all others."""
 
 
 def compared(verdict: dict[str, Any]) -> dict[str, Any]:
-    """What a replay of a recorded verdict must say again."""
+    """Return the fields of a verdict that a replay must repeat, without nulls."""
     said = {name: value for name, value in verdict.items() if name not in IGNORED_FIELDS}
     return dict(without_null(said))
 
 
 def without_null(value: Any) -> Any:  # noqa: ANN401
-    """A message as it is recorded: null is left out, except for a finger that is not known."""
+    """Return a message as it is recorded: without nulls; a finger's null state is `unknown`."""
     if isinstance(value, dict):
         if isinstance(fingers := value.get("fingers"), dict):
             felt = {finger: state or "unknown" for finger, state in fingers.items()}
@@ -47,7 +46,7 @@ def without_null(value: Any) -> Any:  # noqa: ANN401
 
 
 def files(folder: Path) -> list[Path]:
-    """The recordings, oldest first."""
+    """Return the recordings below a folder, oldest first."""
     return sorted((folder / "record").glob("*.mcap"))
 
 
@@ -59,13 +58,13 @@ def recorder(
     clock: Callable[[], int] = time.monotonic_ns,
     **options: Any,  # noqa: ANN401
 ) -> Recorder:
-    """A recorder in a folder."""
+    """Return a recorder that writes below a folder; `options`: of section `record` of a scene."""
     wanted = Record(**{"directory": folder / "record", **options})
     return Recorder(wanted, "right", BOOT, take_header=take_header, tap=tap, clock=clock)
 
 
 def messages(path: Path) -> list[tuple[str, dict[str, Any]]]:
-    """Kind and content of each message of a recording."""
+    """Return kind and content of each message of a recording."""
     with open_recording(path) as stream:
         recording = McapReader(path, stream)
         return [(message.kind, json.loads(message.payload)) for message in recording]

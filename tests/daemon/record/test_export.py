@@ -1,4 +1,4 @@
-"""Outcomes find the very reading that was judged, and tables hold what the files hold."""
+"""Exported tables join each outcome with the counts that were judged."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Writer:
     def judged(
         self, grasp: int, counts: NDArray[np.integer[Any]], *, repaired: Sequence[str] = ()
     ) -> None:
-        """What a grasp was judged by."""
+        """Write the counts by which a grasp was judged."""
         message = Judged(
             boot_id=self._boot_id,
             t_mono_ns=self._now_ns,
@@ -75,13 +75,13 @@ class Writer:
 
 
 def sweeps(number: int, seed: int = 0) -> list[NDArray[np.uint16]]:
-    """Counts as those of grasps, each electrode different in each sweep: all fresh."""
+    """Return counts of sweeps, each shape (3, 24); all electrodes change from sweep to sweep."""
     base = np.random.default_rng(seed).integers(1500, 2500, (3, 24))
     return [(base + 37 * step * (-1) ** step).astype(np.uint16) for step in range(number)]
 
 
 def record(path: Path, *grasps: tuple[NDArray[np.integer[Any]], Ending, str | None]) -> None:
-    """A recording of grasps: counts, outcome and object of each."""
+    """Write a recording of grasps, each given by counts, outcome and object; None: no object."""
     writer = Writer(path)
     for number, (counts, _, _) in enumerate(grasps, 1):
         writer.judged(number, counts)

@@ -1,6 +1,6 @@
-"""What comes over a link stands in a log beside the recording, in the form of its readers.
+"""The traffic of a link is in a log beside the recording, in a format that readers know.
 
-`tests/test_process_replay.py` holds that readers of such logs give the link's own readings.
+`tests/test_process_replay.py` checks that readers of such logs give the link's own readings.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SENT = [can.Message(arbitration_id=0x100, data=bytes([number] * 8)) for number i
 
 
 def tapped(link: Driver, **section: str) -> Tap:
-    """A tap on a driver that is open."""
+    """Open a driver, and return a tap on it. `section`: the scene's section `tactile`."""
     tap = tap_of(link, TypeAdapter(Tactile).validate_python(section))
     assert tap is not None
     link.open()

@@ -66,9 +66,9 @@ class ViewerClient:
         self._socket.sendall(bytes((0x81, 0x80 | len(text), 0, 0, 0, 0)) + text)
 
     def channels(self, wanted: set[str], send: Callable[[], None]) -> dict[str, dict[str, Any]]:
-        """What is advertised, by topic; `send` is called until all `wanted` are there.
+        """Return the advertised channels by topic; call `send` until all `wanted` are there.
 
-        A view that stood still for a second connects again, and has lost what waited.
+        A viewer that was paused for a second reconnects, and has lost the messages that waited.
         """
         found: dict[str, dict[str, Any]] = {}
         while not wanted <= found.keys():
@@ -81,7 +81,7 @@ class ViewerClient:
         return found
 
     def message(self) -> dict[str, Any] | None:
-        """A message, if one comes soon; before its JSON stand opcode 1, subscription and time."""
+        """Return the JSON after opcode 1, subscription and time; None: no message for 50 ms."""
         while select.select([self._socket], [], [], 0.05)[0]:
             frame = self.frame()
             if frame[:1] == b"\x01":
@@ -122,7 +122,7 @@ def test_a_viewer_gets_channels_and_messages_that_their_schemas_allow(tmp_path: 
 
 
 def test_no_thread_of_the_library_asks_python_to_log() -> None:
-    """Such a thread may hold what the thread that runs Python waits for: once both hung."""
+    """A thread of the library that logs in Python could deadlock with a thread of Python."""
     script = """
         import logging
         from graspd.daemon.record.live import LiveServer

@@ -60,7 +60,7 @@ def header(*fingers: str, joints: bool) -> RecordingHeader:
 
 
 def write(path: Path, first: int = 0) -> None:
-    """Readings of two fingers, 2 ms old when they were recorded, flushed after every fifth."""
+    """Write readings of two fingers, 2 ms old when they are recorded; flush after every fifth."""
     file = McapWriter(path, header("ff", "th", joints=True))
     for number in range(first, first + READINGS):
         t_ns = START_NS + number * PERIOD_NS
@@ -213,11 +213,14 @@ def test_messages_that_are_not_readings_are_counted(tmp_path: Path) -> None:
 
 
 MESSAGES = struct.pack("<BQHIQQ", 5, 24, 1, 0, 0, 0) + b"{}"
-"""The smallest message."""
+"""Record of one message with the payload `{}`."""
 
 
 def with_chunk(compression: str, content: bytes, said_bytes: int, times: int = 1) -> bytes:
-    """A recording's header and this chunk some `times`, whose content is packed already."""
+    """Return a file with a header and `times` equal chunks. `content`: compressed already.
+
+    `said_bytes`: unpacked size that the chunks state.
+    """
     builder = RecordBuilder()
     Channel(1, "strange.right", "json", {}, 0).write(builder)
     for _ in range(times):

@@ -28,7 +28,10 @@ from tests.daemon.record.test_mcap import OFFSET_NS, START_NS, WHOLE, header, re
 def packed_again(
     data: bytes, order: Callable[[list[RecordedMessage]], list[RecordedMessage]], **options: int
 ) -> bytes:
-    """The recording as another tool writes it: messages in this order, the metadata at the end."""
+    """Return a recording as another tool writes it: messages by `order`, the metadata last.
+
+    `options`: of the library's `Writer`.
+    """
     stream = io.BytesIO()
     writer = Writer(stream, **{"chunk_size": 4000, **options})  # type: ignore[arg-type]
     writer.start(profile="", library="another tool")
@@ -47,7 +50,7 @@ def packed_again(
 
 
 def in_fifths(messages: list[RecordedMessage]) -> list[RecordedMessage]:
-    """Every fifth message, then every fifth after the first, and the like."""
+    """Return every fifth message, then every fifth from the second on, and so on."""
     return [message for first in range(5) for message in messages[first::5]]
 
 
@@ -139,7 +142,7 @@ LINES: dict[str, tuple[str, object]] = {
     "stable": ("verdict", {"reasons": []}),
     "dropped": ("dropped", {}),
 }
-"""Topics and contents."""
+"""First part of the topic, and content, of each message that the tests name."""
 
 
 @pytest.mark.parametrize(

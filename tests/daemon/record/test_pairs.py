@@ -1,4 +1,4 @@
-"""What one of graspd's writers makes, each of its readers takes; no sweep becomes a grasp."""
+"""Each reader reads the tables of each writer; sweeps of a stream are not read as grasps."""
 
 from __future__ import annotations
 

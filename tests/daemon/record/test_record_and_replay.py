@@ -1,4 +1,4 @@
-"""What is recorded can be judged again, bit for bit, and become a grasp table to learn from."""
+"""Recordings can be judged again, bit for bit, and exported as grasp tables to learn from."""
 
 from __future__ import annotations
 
@@ -36,28 +36,28 @@ from tests.process_replay.streams import demo
 
 @dataclass(frozen=True)
 class Lab:
-    """Recordings of a run, and the messages that it sent."""
+    """Recordings of a run, and the messages that it sent, each as kind and JSON."""
 
     files: list[Path]
     messages: list[tuple[str, str]]
 
 
 def lab_of(folder: Path, **case: Any) -> Lab:  # noqa: ANN401
-    """Run the demo recording with a controller that asks and tells, and record it."""
+    """Judge the demo recording, with a controller that asks and reports outcomes; record it."""
     sent = run(Case(readings=demo, joints=True, tells=True, asks=True, **case), folder / "record")
     return Lab(files(folder), sent)
 
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
-    """One file, judged by the network that knows no session."""
+    """A run of a model without a session, recorded in one file."""
     model = {"model": {"name": "cnn1"}}
     return lab_of(tmp_path_factory.mktemp("lab"), sections=model, readings_max=3000)
 
 
 @pytest.fixture(scope="module")
 def rotated(tmp_path_factory: pytest.TempPathFactory) -> Lab:
-    """A session model on a slow computer; files end after three seconds, whatever is held then."""
+    """A run of a session model on a slow computer; a file ends every 3 s, also amid a grasp."""
     sections = {
         "risk": {"max_slip_when_stable": 0.5, "warm_up": 2},
         "gate": {"max_age_ms": 97.0},  # no reading of the stepped clock is as old to the ns
@@ -73,7 +73,7 @@ def of_kind(path: Path, kind: str) -> list[dict[str, Any]]:
 
 
 def of_readings(path: Path) -> list[dict[str, Any]]:
-    """The verdicts without those on silence, which repeat the time of a reading."""
+    """Return the verdicts on readings, without those on silence, which repeat a reading's time."""
     found: dict[int, dict[str, Any]] = {}
     for verdict in of_kind(path, "verdict"):
         found.setdefault(verdict["t_mono_ns"], verdict)
@@ -83,7 +83,7 @@ def of_readings(path: Path) -> list[dict[str, Any]]:
 
 @cache
 def again(*arguments: object) -> list[dict[str, Any]]:
-    """The verdicts of `graspd replay`; made once for the same files."""
+    """Return the verdicts of `graspd replay --json` with these arguments, which runs once."""
     result = graspd("replay", "--json", *arguments)
     assert result.returncode == 0, result.stderr
     return [json.loads(line) for line in result.stdout.splitlines()]
@@ -127,7 +127,10 @@ def test_a_run_on_a_slow_computer_replays_bit_for_bit(rotated: Lab) -> None:
 
 
 def filtered(source: Path, path: Path, *, metadata: bool = True, every: int = 1) -> Path:
-    """Write a recording again as another tool does: maybe without metadata, or readings thinned."""
+    """Write a recording again as another tool does, and return its path.
+
+    `every`: only readings whose number is a multiple of it are kept.
+    """
     with source.open("rb") as stream, path.open("wb") as target:
         writer, reader = Writer(target), make_reader(stream)
         writer.start(profile="", library="another tool")

@@ -1,4 +1,4 @@
-"""Each file says what was known where it begins, and what changed that from outside is in it."""
+"""Each file has the state at its start, and later events that change the state from outside."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ MS = 1_000_000
 STATUS, VERDICT = b"status.right", b"verdict.right"
 START_NS = 10**12
 NO_VERDICT = cast(Verdict, None)
-"""A recorder gets the verdict as a message."""
+"""Verdict that a recorder is called with and ignores; it records the message of the verdict."""
 
 
 class Loop:
-    """Counts what it sends, and knows how much that was."""
+    """Stand-in for the loop; its headers say how many messages it had sent before the file."""
 
     def __init__(self) -> None:
         self.sent = 0
@@ -62,14 +62,14 @@ class Loop:
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    """That of a recorder whose thread sleeps: a test goes the rounds."""
+    """Clock of a recorder whose thread sleeps: tests call `go_round`. Files end after 600 ms."""
     monkeypatch.setattr("graspd.daemon.record.recorder.ROUNDS_PER_FLUSH", 1e-6)
     monkeypatch.setattr("graspd.daemon.record.recorder.ROTATE_NS", 600 * MS)
     return Clock()
 
 
 def pass_time(clock: Clock, writing: Recorder) -> dict[str, int]:
-    """Let 20 ms pass and the recorder go a round; its counters."""
+    """Let 20 ms pass and the recorder go one round; return its counters."""
     clock.now_ns += 20 * MS
     writing.go_round()
     return writing.counters["record"]
@@ -122,7 +122,7 @@ def test_a_refusing_disk_is_warned_of_once_and_tried_again(
 
 
 class Daemon:
-    """Judges sweeps of the demo recording, recorded: the parts that matter to that, and no time."""
+    """The parts of a daemon that judge and record; readings set its clock."""
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         path = folder / "scene.toml"
@@ -150,9 +150,9 @@ class Daemon:
         return self._now_ns
 
     def judge(self, reading: TactileReading, ages_ms: tuple[int, int] = (0, 0)) -> Judgement:
-        """Judge it, and every second let the recorder go a round and send a status.
+        """Judge and record a reading; after every 100th write the queue and send a status.
 
-        `ages_ms`: age of the reading before the network, and after it.
+        `ages_ms`: age of the reading before the model runs, and after it.
         """
         ages = iter(ages_ms)
         self._now_ns = reading.t_ns
@@ -185,7 +185,7 @@ def sweeps() -> list[TactileReading]:
 
 
 def again(*paths: Path) -> list[Judgement]:
-    """What is judged in a replay, at the times of then."""
+    """Return the judgements of a replay, with the recorded times of the readings."""
     run = RecordedRun(paths)
     wanted = run.scene({}, {}, None)
     parts = run.parts(wanted, assembly.load_model(wanted), None)
@@ -204,7 +204,7 @@ def again(*paths: Path) -> list[Judgement]:
 
 
 def judged_grasps(judgements: list[Judgement]) -> list[tuple[int, Decision]]:
-    """Each first judgement: number of the grasp, and what it was called."""
+    """Return the number and decision of each grasp, by its first judgement."""
     return [(each.moment.grasp, each.decision) for each in judgements if each.moment.judged]
 
 
@@ -236,7 +236,7 @@ def test_a_later_file_judges_as_then_after_a_rest(
 def test_exchanged_sensors_and_late_readings_are_played_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Readings that only the network's time made late are late again too."""
+    """Readings that were late only because the model was slow are late again too."""
     daemon = Daemon(tmp_path, monkeypatch)
     expected, states = [], []
     ages_ms = {7: (101, 101), 8: (101, 120), 20: (50, 101), 31: (0, 200), 32: (100, 100)}

@@ -1,4 +1,4 @@
-"""The recorder keeps what it gets, in bounds; what the disk does is not the loop's affair."""
+"""The recorder writes all entries within limits; a slow or full disk never delays the loop."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def test_all_files_together_keep_within_their_size(tmp_path: Path) -> None:
 
 @pytest.fixture
 def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
-    """It hangs."""
+    """A disk that hangs until `goes_on` is set."""
     made = Disk(monkeypatch, "fdatasync")
     made.goes_on.clear()
     return made
@@ -191,7 +191,7 @@ def test_a_full_disk_counts_what_it_does_not_keep(
 ) -> None:
     """Ten entries wait for a flush; of the twenty that follow the disk refuses the fifth.
 
-    The test goes the rounds itself: with this interval the thread's first one comes after 6 s.
+    The test calls `go_round`: at this interval the thread's first round comes after 6 s.
     """
     monkeypatch.setattr(recorder_module, "FLUSH_NS", 60_000_000_000)
     writing = make()

@@ -28,7 +28,10 @@ PLAIN = ("boolean", "string", "number", "integer")
 
 
 def faults(schema: dict[str, Any], where: str) -> Iterator[str]:
-    """Whatever Lichtblick's `parseJsonSchema` throws at, and more: only words that it knows."""
+    """Yield what Lichtblick's `parseJsonSchema` refuses in a schema, and words unknown to it.
+
+    `where`: name of the schema, or of the part, in the texts.
+    """
     known = {"$schema", "title", "description", "type", "properties", "additionalProperties"}
     known |= {"required", "items", "enum", "contentEncoding"}
     known |= {"minimum", "maximum", "maxItems", "pattern"}
@@ -81,7 +84,7 @@ def said(viewer: Viewer, kind: str, content: object) -> list[tuple[int, str, str
 
 
 def drawn(viewer: Viewer, content: object, wall_ns: int = 10**8) -> NDArray[np.uint8] | None:
-    """Colour of each pixel of the tactile image of a reading; None if there is none."""
+    """Return the tactile image of a reading, shape (height, width, 3); None if none is drawn."""
     images = [
         json.loads(payload)
         for kind, payload in viewer.of("tactile", content, wall_ns)
