@@ -90,7 +90,7 @@ def record(path: Path, *grasps: tuple[NDArray[np.integer[Any]], Ending, str | No
     writer.close()
 
 
-def test_a_row_is_judged_unless_electrodes_are_broken(
+def test_only_judgements_of_sound_readings_have_judged_counts(
     tmp_path: Path,
 ) -> None:
     wanted = scene.load(demo_scene(tmp_path, sections='[model]\nname = "cnn1"'))
@@ -110,7 +110,7 @@ def test_a_row_is_judged_unless_electrodes_are_broken(
     assert unusable.judged_counts is None
 
 
-def test_what_is_left_out_is_counted(tmp_path: Path) -> None:
+def test_the_export_counts_grasps_and_outcomes_left_out(tmp_path: Path) -> None:
     writer = Writer(tmp_path / "a.mcap")
     for grasp, counts in enumerate(sweeps(8)):
         if grasp >= 4:
@@ -137,7 +137,7 @@ def test_of_grasps_with_the_same_counts_the_first_is_kept(tmp_path: Path) -> Non
     assert len(read_table(tmp_path / "a.csv").slipped) == 2
 
 
-def test_a_row_has_the_reported_object_or_the_options(
+def test_a_row_names_the_reported_object_else_the_given_one(
     tmp_path: Path,
 ) -> None:
     writer = Writer(tmp_path / "a.mcap")
@@ -185,7 +185,7 @@ def test_the_library_reads_the_grasps_that_are_exported(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["=HYPERLINK(0)", "mug\n=1"])
-def test_a_name_that_a_spreadsheet_calculates_is_refused(tmp_path: Path, name: str) -> None:
+def test_an_object_name_that_a_spreadsheet_calculates_is_refused(tmp_path: Path, name: str) -> None:
     record(tmp_path / "a.mcap", (sweeps(1)[0], "slip", name))
     out = tmp_path / "t.csv"
     result = graspd("export-grasps", tmp_path / "a.mcap", "--out", out)
@@ -196,7 +196,7 @@ def test_a_name_that_a_spreadsheet_calculates_is_refused(tmp_path: Path, name: s
     assert "an object has a name of letters" in result.stderr
 
 
-def test_an_outcome_may_be_told_to_the_next_start(tmp_path: Path) -> None:
+def test_an_outcome_reported_after_a_restart_finds_its_grasp(tmp_path: Path) -> None:
     first, second = Writer(tmp_path / "a.mcap"), Writer(tmp_path / "b.mcap", boot_id="f" * 32)
     first.judged(1, sweeps(1)[0])
     second.judged(1, sweeps(1, seed=1)[0])

@@ -39,7 +39,7 @@ def log_of(folder: Path, ending: str) -> Path:
     return path
 
 
-def test_a_serial_log_has_both_ways_also_before_the_recording(tmp_path: Path) -> None:
+def test_a_serial_log_has_both_directions_from_before_the_recording(tmp_path: Path) -> None:
     clock = Clock()
     driver = SpiBridgeDriver("loop://", FINGERS, clock=clock)
     tap = tapped(driver, driver="spi", port="loop://")
@@ -61,7 +61,7 @@ def test_a_serial_log_has_both_ways_also_before_the_recording(tmp_path: Path) ->
     assert times[2] <= before_ns <= times[3] <= time.monotonic_ns()
 
 
-def test_a_bus_log_is_what_other_programs_read(tmp_path: Path) -> None:
+def test_python_can_reads_back_the_can_log(tmp_path: Path) -> None:
     driver = CanBridgeDriver("virtual", "of a log", FINGERS)
     tap = tapped(driver, driver="can", interface="virtual", channel="of a log")
     writing = recorder(tmp_path, tap=tap, raw=True)

@@ -121,7 +121,7 @@ def test_a_viewer_gets_channels_and_messages_that_their_schemas_allow(tmp_path: 
     jsonschema.validate(message, json.loads(schemas()["verdict"][1]))
 
 
-def test_no_thread_of_the_library_asks_python_to_log() -> None:
+def test_the_foxglove_library_never_logs_through_python() -> None:
     """A thread of the library that logs in Python could deadlock with a thread of Python."""
     script = """
         import logging

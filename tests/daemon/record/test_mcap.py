@@ -121,7 +121,7 @@ def test_a_header_comes_back_as_it_was_written(state: dict[str, Any], fingers: s
         *[("session", "{}"), ("trust", "A"), ("grasps", ""), ("file", "first")],
     ],
 )
-def test_a_file_with_another_header_is_refused(
+def test_a_file_with_an_invalid_header_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, text: str | None
 ) -> None:
     texts = header("ff", joints=False).texts() | ({} if text is None else {name: text})
@@ -133,7 +133,7 @@ def test_a_file_with_another_header_is_refused(
         header_of(tmp_path / "a.mcap")
 
 
-def test_readings_come_back_as_old_as_they_were(tmp_path: Path) -> None:
+def test_readings_are_replayed_in_order_with_their_recorded_age(tmp_path: Path) -> None:
     write(tmp_path / "a.mcap")
     write(tmp_path / "b.mcap", first=READINGS)
     found: list[TactileReading] = []
@@ -176,7 +176,7 @@ def test_a_file_cut_anywhere_gives_what_was_flushed_before(at: int) -> None:
 
 @given(st.lists(st.tuples(st.integers(0, len(WHOLE) - 1), st.integers(0, 255)), max_size=5))
 @settings(max_examples=300, deadline=None)
-def test_no_damage_makes_the_reader_raise_anything_else(changes: list[tuple[int, int]]) -> None:
+def test_damage_raises_recording_error_or_nothing(changes: list[tuple[int, int]]) -> None:
     data = bytearray(WHOLE)
     for at, value in changes:
         data[at] = value
@@ -184,7 +184,7 @@ def test_no_damage_makes_the_reader_raise_anything_else(changes: list[tuple[int,
         read(bytes(data))
 
 
-def test_messages_that_are_not_readings_are_counted(tmp_path: Path) -> None:
+def test_malformed_readings_are_counted_and_left_out(tmp_path: Path) -> None:
     file = McapWriter(tmp_path / "a.mcap", header("ff", joints=False))
     good = {
         **{"v": 1, "boot_id": BOOT, "seq": 1, "t": 0.0, "t_mono_ns": 5},
@@ -240,7 +240,7 @@ def zstd(content: bytes, *, sized: bool = True) -> bytes:
 
 
 @pytest.mark.parametrize("compression", ["", "zstd", "lz4"])
-def test_files_that_other_tools_repacked_are_read(compression: str) -> None:
+def test_chunks_of_each_compression_are_read(compression: str) -> None:
     content = MESSAGES * 1000
     pack = {"": bytes, "zstd": zstd, "lz4": lz4.frame.compress}[compression]
     found = read(with_chunk(compression, pack(content), len(content)))
@@ -262,14 +262,14 @@ BOMB = MESSAGES * (CHUNK_MAX_BYTES // len(MESSAGES) + 1)
         ("", BOMB),
     ],
 )
-def test_a_chunk_of_more_than_a_recording_has_is_refused(
+def test_a_chunk_that_unpacks_to_over_the_limit_is_refused(
     compression: str, content: bytes, said_bytes: int
 ) -> None:
     with pytest.raises(RecordingError, match=r"a\.mcap: unpacks to more than any recording"):
         read(with_chunk(compression, content, said_bytes))
 
 
-def test_many_small_chunks_do_not_pass_the_limit(tmp_path: Path) -> None:
+def test_many_chunks_that_together_exceed_the_limit_are_refused(tmp_path: Path) -> None:
     content = MESSAGES * 30_000
     path = tmp_path / "a.mcap"
     path.write_bytes(with_chunk("zstd", zstd(content), len(content), times=100))
@@ -285,7 +285,9 @@ def test_many_small_chunks_do_not_pass_the_limit(tmp_path: Path) -> None:
     ("compression", "content"),
     [("zstd", zstd(b"a" * 99)), ("zstd", b"abc"), ("lz4", b"abcdefgh" * 9), ("brotli", b"a")],
 )
-def test_a_chunk_that_is_not_what_it_says_is_damage(compression: str, content: bytes) -> None:
+def test_a_chunk_of_wrong_size_or_compression_counts_as_damage(
+    compression: str, content: bytes
+) -> None:
     reader = McapReader(Path("a.mcap"), io.BytesIO(with_chunk(compression, content, 100)))
     assert list(reader) == []
     assert reader.cut_off

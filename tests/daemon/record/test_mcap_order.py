@@ -56,7 +56,7 @@ def in_fifths(messages: list[RecordedMessage]) -> list[RecordedMessage]:
 
 @given(st.randoms(use_true_random=False), st.integers(1, 20_000), st.booleans())
 @settings(max_examples=50, deadline=None)
-def test_no_order_and_no_cut_gives_readings_out_of_time(
+def test_shuffled_or_cut_files_are_read_in_time_order(
     random: Random, chunk: int, chunked: bool
 ) -> None:
     def shuffled(messages: list[RecordedMessage]) -> list[RecordedMessage]:
@@ -69,14 +69,14 @@ def test_no_order_and_no_cut_gives_readings_out_of_time(
         assert found == sorted(found)
 
 
-def test_times_too_far_apart_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_messages_too_far_out_of_order_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mcap_reader, "OPEN_MAX_BYTES", 10_000)
     with pytest.raises(RecordingError, match="`mcap sort` puts it in order"):
         read(packed_again(WHOLE, in_fifths))
     assert read(packed_again(WHOLE, list)) == read(WHOLE)
 
 
-def test_a_file_without_its_metadata_tells_its_fingers() -> None:
+def test_without_metadata_the_messages_give_the_header() -> None:
     reader = McapReader(Path("a.mcap"), io.BytesIO(without_metadata(WHOLE)))
     assert reader.header.fingers == ("ff", "th")
     assert (reader.header.boot_id, reader.header.joints) == (BOOT, True)

@@ -24,7 +24,7 @@ WRITERS: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
-def test_every_reader_takes_what_a_writer_makes(
+def test_every_reader_reads_the_table_of_each_writer(
     tmp_path: Path, write: Callable[[Path], object]
 ) -> None:
     plain, path = read_grasps(DEMO_TABLE), tmp_path / "written"

@@ -148,14 +148,14 @@ def filtered(source: Path, path: Path, *, metadata: bool = True, every: int = 1)
     return path
 
 
-def test_verdicts_that_are_not_those_of_the_run_are_counted(lab: Lab, tmp_path: Path) -> None:
+def test_replay_reports_verdicts_that_differ_from_recorded_ones(lab: Lab, tmp_path: Path) -> None:
     whole = filtered(lab.files[0], tmp_path / "whole.mcap")
     assert "not those of the run" not in graspd("replay", whole).stderr
     path = filtered(lab.files[0], tmp_path / "part.mcap", every=3)
     assert "verdicts are not those of the run" in graspd("replay", path).stderr
 
 
-def test_a_filtered_recording_is_judged_with_a_warning(
+def test_a_recording_without_metadata_is_judged_with_a_warning(
     lab: Lab, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """As `mcap filter` leaves it: no metadata."""
@@ -192,15 +192,13 @@ def test_the_summary_of_a_replay_counts_recorded_outcomes(rotated: Lab) -> None:
     assert graspd("replay", "--outcomes", *rotated.files).returncode == 2
 
 
-def test_sweeps_of_a_recording_are_never_judged_one_by_one(rotated: Lab) -> None:
+def test_a_recording_is_not_replayed_with_gate_every(rotated: Lab) -> None:
     result = graspd("replay", *rotated.files, "--gate", "every")
     assert (result.returncode, result.stdout) == (2, "")
     assert "gate mode `every` judges each row of a grasp table" in result.stderr
 
 
-def test_files_that_do_not_follow_each_other_are_named(
-    rotated: Lab, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_warning_names_a_file_after_a_gap(rotated: Lab, caplog: pytest.LogCaptureFixture) -> None:
     first, second, third = rotated.files[:3]
     recorded = RecordedRun([first, second, third])
     wanted = recorded.scene({}, {}, None)
@@ -210,7 +208,7 @@ def test_files_that_do_not_follow_each_other_are_named(
     assert f"{third}: does not continue where the file before it ends" in caplog.text
 
 
-def test_learning_of_another_graspd_is_left_out_with_a_warning(
+def test_learning_of_an_older_version_is_left_out_with_warning(
     rotated: Lab, caplog: pytest.LogCaptureFixture
 ) -> None:
     run = RecordedRun(rotated.files[1:2])
@@ -226,7 +224,7 @@ def test_learning_of_another_graspd_is_left_out_with_a_warning(
     assert f"{rotated.files[1]}: begins in the middle of a run" in caplog.text
 
 
-def test_exported_grasps_are_judged_as_then(lab: Lab, tmp_path: Path) -> None:
+def test_exported_grasps_are_judged_as_in_the_run(lab: Lab, tmp_path: Path) -> None:
     table = tmp_path / "lab.csv"
     result = graspd("export-grasps", *lab.files, "--out", table, "--object", "mug")
     assert result.returncode == 0, result.stderr

@@ -75,7 +75,7 @@ def pass_time(clock: Clock, writing: Recorder) -> dict[str, int]:
     return writing.counters["record"]
 
 
-def test_the_next_file_begins_with_what_was_known(tmp_path: Path, clock: Clock) -> None:
+def test_each_files_header_has_the_state_at_its_start(tmp_path: Path, clock: Clock) -> None:
     loop = Loop()
     loop.sent = 7
     writing = recorder(tmp_path, loop.header, clock=clock)
@@ -96,7 +96,7 @@ def test_the_next_file_begins_with_what_was_known(tmp_path: Path, clock: Clock) 
     assert writing.counters["record"]["recorded"] == loop.sent - 7
 
 
-def test_a_refusing_disk_is_warned_of_once_and_tried_again(
+def test_a_failing_disk_is_warned_of_once_and_retried(
     tmp_path: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
@@ -208,7 +208,7 @@ def judged_grasps(judgements: list[Judgement]) -> list[tuple[int, Decision]]:
     return [(each.moment.grasp, each.decision) for each in judgements if each.moment.judged]
 
 
-def test_a_later_file_judges_as_then_after_a_rest(
+def test_a_later_file_replays_alike_once_the_hand_was_idle(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     daemon = Daemon(tmp_path, monkeypatch)
@@ -233,7 +233,7 @@ def test_a_later_file_judges_as_then_after_a_rest(
     assert compared >= 2
 
 
-def test_exchanged_sensors_and_late_readings_are_played_again(
+def test_a_replay_repeats_sensor_exchanges_and_late_readings(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Readings that were late only because the model was slow are late again too."""

@@ -76,7 +76,7 @@ def test_a_file_has_the_daemons_header_and_clock(tmp_path: Path, make: Make) -> 
     assert path.stat().st_mode & 0o777 == 0o640
 
 
-def test_files_follow_each_other_by_size_without_a_loss(
+def test_new_files_begin_by_size_without_losing_entries(
     tmp_path: Path, make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(mcap, "ROTATE_BYTES", 100_000)
@@ -152,7 +152,7 @@ def test_entries_are_dropped_and_counted_while_a_disk_stalls(
     assert (loss.kind, last.kind) == ("dropped", before[-1].kind)
 
 
-def test_the_end_waits_for_no_disk_that_never_answers(
+def test_closing_does_not_wait_for_a_disk_that_hangs(
     make: Make,
     disk: Disk,
     monkeypatch: pytest.MonkeyPatch,
@@ -166,7 +166,7 @@ def test_the_end_waits_for_no_disk_that_never_answers(
     disk.goes_on.set()
 
 
-def test_a_run_without_a_hand_waits_for_its_disk(
+def test_a_replay_recorder_waits_for_a_slow_disk(
     tmp_path: Path, disk: Disk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(recorder_module, "CLOSE_S", 0.0)
@@ -186,7 +186,7 @@ def test_a_run_without_a_hand_waits_for_its_disk(
     assert writing.counters["record"]["dropped"] == 0
 
 
-def test_a_full_disk_counts_what_it_does_not_keep(
+def test_all_unflushed_entries_count_as_lost_on_a_full_disk(
     make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Ten entries wait for a flush; of the twenty that follow the disk refuses the fifth.
@@ -216,7 +216,7 @@ def test_a_full_disk_counts_what_it_does_not_keep(
     assert (counted["recorded"], counted["lost"], counted["failures"]) == (0, 31, 1)
 
 
-def test_recordings_stand_beside_the_scene_or_with_the_state(tmp_path: Path) -> None:
+def test_the_record_folder_is_beside_the_scene_or_the_default(tmp_path: Path) -> None:
     tactile = {"driver": "palm", "source": "udp://127.0.0.1:1"}
     for record, folder in (
         ({"directory": "kept"}, tmp_path / "kept"),

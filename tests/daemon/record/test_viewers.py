@@ -63,7 +63,7 @@ def test_a_viewer_can_read_the_schema_of_every_topic(topic: Topic) -> None:
     assert list(faults(schema, topic)) == []
 
 
-def test_an_unknown_finger_is_a_state_of_its_own() -> None:
+def test_an_unknown_finger_is_recorded_as_unknown() -> None:
     told = {"fingers": {"ff": "slide", "mf": None}, "motion": {"ff": None}, "p_slip": None}
     assert flat(told) == {"fingers": {"ff": "slide", "mf": "unknown"}, "motion": {}}
     fields = json.loads(schemas()[Topic.VERDICT][1])["properties"]["fingers"]["properties"]
@@ -105,7 +105,7 @@ REST = np.full((2, 24), 2000)
 DARK, YELLOW, CYAN, BLACK = (38, 44, 54), (252, 255, 190), (0, 220, 220), (0, 0, 0)
 
 
-def test_a_pressed_electrode_alone_shines_in_its_place() -> None:
+def test_only_the_pressed_electrodes_pixel_is_drawn_yellow() -> None:
     viewer = Viewer()
     said(viewer, "verdict", open_hand())
     for number in range(1, 30):
@@ -135,7 +135,9 @@ def test_a_pressed_electrode_alone_shines_in_its_place() -> None:
         ((1000, 500, 599, 600), (1000, 500, 600)),  # the clock was set back
     ],
 )
-def test_ten_images_come_a_second(times_ms: Sequence[int], drawn_ms: Sequence[int]) -> None:
+def test_at_most_ten_images_are_drawn_a_second(
+    times_ms: Sequence[int], drawn_ms: Sequence[int]
+) -> None:
     viewer = Viewer()
     made = {at: drawn(viewer, reading(REST), 10**18 + at * 1_000_000) for at in times_ms}
     assert [at for at, image in made.items() if image is not None] == list(drawn_ms)
@@ -150,11 +152,11 @@ def test_ten_images_come_a_second(times_ms: Sequence[int], drawn_ms: Sequence[in
         *[(kind, {"grasp": "one"}) for kind in ("gate", "verdict", "outcome", "status", "joints")],
     ],
 )
-def test_a_broken_message_comes_to_nothing(kind: str, content: object) -> None:
+def test_a_malformed_message_gives_no_log_line_or_image(kind: str, content: object) -> None:
     assert list(Viewer().of(kind, content, 10**9)) == []
 
 
-def test_a_verdict_is_said_when_it_changes_and_not_again() -> None:
+def test_a_verdict_is_logged_only_when_it_changes() -> None:
     viewer = Viewer()
     moving = json.loads(verdict(0, grasp=1, reasons=[Reason.MOVING]))
     (line,) = said(viewer, "verdict", moving)
@@ -185,7 +187,7 @@ ASKED, SKIPPED = Topic.ASKED, Topic.SKIPPED
     ],
     ids=["in a row", "around a loss", "around an exchange"],
 )
-def test_events_come_back_in_order_as_they_were(
+def test_events_are_replayed_in_order_and_repeated_questions_once(
     tmp_path: Path, events: list[Topic | Exchanged], recorded: list[Topic | Exchanged]
 ) -> None:
     writing = recorder(tmp_path)
