@@ -89,7 +89,7 @@ def load_own(path: Path) -> tuple[bytes, bytes]:
 
 
 def load_public(path: Path, what: str = "the key") -> bytes:
-    """Return the public key, Z85, of a file. Raises `KeysError`, which calls it `what`."""
+    """Return the public key, Z85, of a file. `what`: its name in errors. Raises `KeysError`."""
     return _load(path, what)[0]
 
 

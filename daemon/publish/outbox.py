@@ -39,7 +39,7 @@ SHA_DIGITS = 12
 BUCKET_RATIO = 1.02
 """Ratio of a bucket's two ends, so percentiles are exact to 2 %."""
 FLOOR_US = 0.1
-"""Lower end of the first bucket, us, which has shorter durations too."""
+"""Lower end of the first bucket, us; shorter durations count in it too."""
 BUCKETS = math.ceil(math.log(1e8 / FLOOR_US) / math.log(BUCKET_RATIO)) + 1
 """Number of buckets, up to 100 s."""
 OUTAGE_PERIODS = 10

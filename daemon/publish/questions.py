@@ -45,7 +45,7 @@ class Question:
     envelope: Frames
     """Frames before the answer's text: routing id, and the delimiter of a REQ socket."""
     due_ns: int
-    """Latest time at which it is answered, monotonic ns."""
+    """Time by which the question is answered, monotonic ns."""
     lifts: bool
     """True for `lift`, False for `judge`."""
     offer: tuple[GraspId, Decision] | None = None
