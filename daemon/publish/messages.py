@@ -245,7 +245,7 @@ class Status(_Message, frozen=True, kw_only=True):
     readings_hz: Duration
     """Tactile readings per second since the last status."""
     verdicts: dict[Decision, Count]
-    """Verdicts since start, by outcome."""
+    """Verdicts since start, by decision."""
     reasons: dict[Reason, Count]
     """Reasons given since start; only those that occurred."""
     drivers: dict[str, dict[str, Count]]

@@ -108,7 +108,7 @@ class ReplayTactile(DriverSection):
     driver: Literal["replay"]
     """Selects this driver."""
     recordings: Annotated[tuple[FilePath, ...], Field(min_length=1, strict=False)]
-    """Grasp tables or streams (deploy/RECORDING.md), in this order."""
+    """Recordings of any kind (deploy/RECORDING.md), in this order."""
     pace: Literal["realtime", "fast"] = "realtime"
     """`realtime`: a grasp table has 100 rows a second; `fast`: as fast as they can be judged."""
     loop: bool = False
