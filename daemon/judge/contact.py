@@ -21,43 +21,43 @@ WINDOW = 100
 TARE_EVERY = 25
 """Untouched sweeps from one tare to the next."""
 TOUCH_COUNTS = 20.0
-"""Smallest fall below the baseline of a touch, counts.
+"""Smallest fall below the baseline that counts as a touch, counts.
 
 In 9.8 s of three untouched sensors no fall was over 10. On the same sensors each fall of three
 electrodes by 24 was seen as a touch.
 """
 TOUCH_SIGMAS = 5.0
-"""Smallest fall of a touch, in standard deviations of the finger's median electrode."""
+"""Smallest fall of a touch, in units of the finger's noise, `Rest.sigma`."""
 FALLEN = 3
 """Rank of the fall that decides: the third deepest. A spike hits one electrode, rarely two."""
 SOUND_MIN = 12
 """Fewest usable electrodes, of 24, by which contact of a finger is known."""
 LET_GO = 0.6
-"""Share of a touch's threshold below which a touching finger has let go."""
+"""A touching finger lets go when its fall is below this share of a touch's threshold."""
 RELEASED = 0.25
-"""Share of the depth of a hold below which a touching finger has let go.
+"""A touching finger also lets go when its fall is below this share of the depth of its hold.
 
 Electrodes drift apart in a long hold, so an open hand may look as if it touched lightly.
 """
 RELEASED_LONG = 0.5
 """Value of `RELEASED` after a hold of `LONG_HOLD_NS`: drift grows with time."""
 DEPTH_FADES_COUNTS_PER_S = 5.0
-"""Speed at which the depth of a hold falls to that of a lighter touch."""
+"""Speed at which the remembered depth of a hold falls while the finger presses less."""
 APART_NS = 50_000_000
 """Shortest time from letting go to the next touch, ns.
 
 The electrodes of an opening finger rise one sweep after the other, which looks like a touch.
 """
 LONG_HOLD_NS = 60_000_000_000
-"""Duration of a hold after which a finger is tared again, ns.
+"""Longest hold after whose end a finger keeps its tare, ns.
 
 Electrodes of one finger drift apart by 0.2 counts/s (measured on three sensors). After this time
 the drift is more than half of `TOUCH_COUNTS`.
 """
 ALONE_NS = 30_000_000_000
-"""Time for which a finger touches without all others before it is tared again: no grasp, ns."""
+"""Longest touch while another finger does not touch, ns: no grasp; then it is tared again."""
 SUSPECT = 0.5
-"""Share of a touch's threshold above which a sweep is not used for the tare."""
+"""A sweep with a fall above this share of a touch's threshold is not used for the tare."""
 SIGMA_MIN_COUNTS = 1.5
 """Smallest assumed noise of an electrode, counts; a quiet one may show no noise at all."""
 SIGMA_MAX_COUNTS = 10.0
@@ -162,7 +162,7 @@ class Rest(NamedTuple):
     baseline: Floats
     """Resting count of each electrode."""
     sigma: float
-    """Standard deviation of its median electrode, counts."""
+    """Noise of the finger: median of its electrodes' standard deviations, counts."""
     known: NDArray[np.bool_]
     """True for electrodes whose baseline is known."""
 
@@ -174,7 +174,7 @@ class Window:
     counts: NDArray[np.uint16]
     usable: NDArray[np.bool_]
     number: int = 0
-    """Sweeps so far."""
+    """Number of sweeps added so far."""
 
     @classmethod
     def of(cls, fingers: int) -> Window:
@@ -190,7 +190,10 @@ class Window:
         self.number += 1
 
     def rests(self, fingers: Sequence[int]) -> Iterator[Rest | None]:
-        """Yield the tare of each of these fingers; None: it moved. Call it with a full window."""
+        """Yield the tare of each of these rows; None: it moved, or has too few sound electrodes.
+
+        Call it after at least `WINDOW` sweeps.
+        """
         oldest = self.number % WINDOW
         sweeps = np.concatenate((self.counts[oldest:], self.counts[:oldest]))
         # Counts that are contiguous by electrode and 32 bits wide sort in a quarter of the time.
@@ -218,7 +221,7 @@ class Contact:
     """Tares all fingers while they rest, and finds which touch. Constant memory, no clock."""
 
     def __init__(self, fingers: int) -> None:
-        """`fingers`: their number. None has a baseline yet."""
+        """`fingers`: their number. No finger has a baseline yet."""
         shape = (fingers, ELECTRODES)
         self.touches = [Touch() for _ in range(fingers)]
         self.touching = [False] * fingers
@@ -245,9 +248,10 @@ class Contact:
         median: NDArray[np.uint16],
         usable: NDArray[np.bool_] | None,
     ) -> None:
-        """Take in the sweep `counts` of `t_ns`, and the median of the last three.
+        """Update `touching`, `tared` and `baseline` by the sweep `counts` of `t_ns`.
 
-        Arrays have shape (fingers, 24). `usable`: False for electrodes to ignore; None: use all.
+        `median`: that of each electrode's last three values. Arrays have shape (fingers, 24).
+        `usable`: False for electrodes to ignore; None: use all.
         """
         falls, numbers = self._falls(median, usable)
         elapsed_s = 0.0 if self._last_ns is None else max(t_ns - self._last_ns, 0) / 1e9

@@ -18,7 +18,7 @@ WITHHELD: Final = {
     Permission.UNPROVEN: Reason.UNPROVEN,
     Permission.RISK_EXCEEDED: Reason.RISK_EXCEEDED,
 }
-"""Why a grasp must not be called `stable`, by what the risk permits."""
+"""Reason against calling a grasp `stable`, by what the risk permits; None: no reason."""
 
 
 # Without slots, so that a default can be read from the class.
@@ -54,7 +54,7 @@ class HandLimits:
 # Without slots, so that a default can be read from the class.
 @dataclass(frozen=True)
 class Limits:
-    """Limits that `stable` and `slip` must keep; a verdict beyond one is `unknown`."""
+    """Limits by which a verdict is `stable`, `slip` or `unknown`."""
 
     max_age_ns: int = 100_000_000
     """Largest age of the reading at the end of judging, ns."""
@@ -70,7 +70,7 @@ class Limits:
 
 
 class HoldDown(msgspec.Struct, frozen=True, gc=False):
-    """A judgement that was not `stable`. Later judgements of its grasp may not be `stable` yet."""
+    """A judgement that was not `stable`: until `until_ns`, its grasp may not be called `stable`."""
 
     grasp: int
     until_ns: int
@@ -87,9 +87,9 @@ class HoldDown(msgspec.Struct, frozen=True, gc=False):
 
 
 NOTHING_HELD: Final = HoldDown(0, 0, Decision.STABLE)
-"""Value before any judgement. It applies to no grasp, because grasps are numbered from 1."""
+"""Stands for no hold-down: it allows every decision. Grasps are numbered from 1."""
 HELD: Final = Moment(0)
-"""Moment of a hand that holds still. With it `decide` goes by the network's answer alone."""
+"""Moment of a hand that holds still: `decide` finds nothing in it against a verdict."""
 
 
 def decide(

@@ -1,4 +1,4 @@
-"""The hand of a grasp table: each reading is a grasp of its own, held still and touched by all."""
+"""The hand of a grasp table: each reading is a grasp of its own, which all fingers hold still."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from graspd.drivers.base import JointReading
 
 
 class EveryReading:
-    """Has every usable reading judged; stands where `HandTracker` does for live readings."""
+    """Has every usable reading judged; used for a table in place of `HandTracker`."""
 
     on_request = False
     state: GateState | None = None
     tared: tuple[Finger, ...] | None = None
     read_rest: Callable[[], NDArray[np.float64]] | None = None
-    """A table has no gate, no tare and no rest."""
+    """None, like `state` and `tared`: a table has no gate, no tare and no resting counts."""
 
     def __init__(self) -> None:
         self.grasp = 0
@@ -53,14 +53,14 @@ class EveryReading:
         self.grasp = grasp
 
     def health(self) -> dict[str, Reason]:
-        """Return nothing: there is neither tare nor joints."""
+        """Return an empty dictionary: there is neither tare nor joints."""
         return {}
 
     def observe_joints(self, reading: JointReading) -> None:
         """Ignore joint angles."""
 
     def ask(self) -> None:
-        """Ignore a question: every reading is judged."""
+        """Ignore a request for a judgement: every reading is judged."""
 
     def interrupt(self) -> None:
         """Ignore missing readings: no grasp continues the one before."""
@@ -69,4 +69,4 @@ class EveryReading:
         """Ignore a restart: no grasp continues the one before."""
 
     def forget(self) -> None:
-        """Ignore an exchange of sensors: nothing is known of them."""
+        """Ignore an exchange of sensors: nothing is remembered of them."""

@@ -17,7 +17,7 @@ class Exchanged(msgspec.Struct, frozen=True, omit_defaults=True):
     session: SessionState | None = None
     learned: LearnerState | None = None
     proven: Count = 0
-    """Number of outcomes with them that count for the warm-up of the risk."""
+    """Number of known outcomes with the new sensors that count for the warm-up of the risk."""
     budget: float | None = None
     """Number of slips that the configured risk still allowed with them; None: not known."""
     tared: bool = False

@@ -29,10 +29,10 @@ REFRESH_NS = 50_000_000
 """Age at which a verdict is refreshed, ns: half of `STANDS_NS`, so that it is never older than
 that, even with slow readings of which one is lost."""
 STANDS_NS = 100_000_000
-"""Age above which a verdict no longer stands, ns."""
+"""Largest age of a verdict, ns. After it, even a reading without new values is judged."""
 CHANGE_COUNTS = 40.0
-"""Largest mean change of a finger's electrodes since the judgement, counts. Above it the grasp is a
-different one, and must settle again."""
+"""Largest mean change of a finger's electrodes since the first judgement, counts. Above it the
+grasp is a different one, and must settle again."""
 RELEASE_NS = 100_000_000
 """How long the gate stays in `released` before `idle`, ns."""
 JUST_SHORT_NS = LONG_NS - 1_000_000
@@ -92,7 +92,7 @@ class Stillness:
         self.moved_since_ns = None
 
     def restart(self, t_ns: int) -> None:
-        """Count stillness from `t_ns` on."""
+        """Start to count stillness again at a reading of `t_ns`, whose time may have gone back."""
         self._since_ns, self.lasts_ns = None, 0
         self._touched_ns = min(self._touched_ns, t_ns)
 
@@ -128,7 +128,7 @@ class Question:
         return self.asked or not self._on_request
 
     def is_due(self, t_ns: int, fresh: bool) -> bool:
-        """Return True if the reading of `t_ns` is to judge a judged grasp again.
+        """Return True if a judged grasp is to be judged again by the reading of `t_ns`.
 
         `fresh`: the reading has new values.
         """
@@ -151,7 +151,7 @@ class Question:
 
 
 class Gate:
-    """Follows the grasps of one hand."""
+    """State machine of one hand's grasps: says which reading of a grasp is to be judged."""
 
     def __init__(self, fingers: Sequence[Finger], limits: HandLimits, motion: Motion) -> None:
         """`fingers`: the rows of a reading. `motion`: their motion, which the caller updates."""
@@ -175,8 +175,8 @@ class Gate:
         self._not_looked = unknown, dict.fromkeys(fingers, 1.0)
 
     def ask(self) -> None:
-        """Ask for a judgement. It is dropped if no grasp settles in `request_ns` from the next
-        reading."""
+        """Ask for a judgement. The request is dropped if no grasp settles in `request_ns` from the
+        next reading."""
         self._question.ask()
 
     def step(
@@ -231,7 +231,10 @@ class Gate:
         judges: bool = False,
         judged: bool = False,
     ) -> Moment:
-        """Return the state of the grasp with the pending changes, and clear these."""
+        """Return the state of the grasp, with the changes of the gate since the last call.
+
+        The arguments go into the moment as they are.
+        """
         phase, still = self.phase, self._still
         is_judged, reasons = phase.state is GateState.JUDGED, self._objections
         if not (reasons or is_judged):
@@ -350,7 +353,10 @@ class Gate:
         return self._question.answer(t_ns, first=first)
 
     def _nearest_to_limit(self) -> tuple[dict[Finger, float | None], dict[Finger, float]]:
-        """Return each finger's motion in the window that is closer to its limit, and that limit."""
+        """Return each finger's motion and limit in the window whose motion is nearer to its limit.
+
+        None: the motion is not known.
+        """
         motion: dict[Finger, float | None] = {}
         limits: dict[Finger, float] = {}
         now, most = self._motion, self._motion.loose if self._still.sure else self._motion.strict

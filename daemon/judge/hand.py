@@ -45,7 +45,7 @@ A real hold passes the limit of motion for moments; a quarter of them are shorte
 
 
 class FreshMedian:
-    """Median of the last three fresh values of each electrode; constant memory, no clock."""
+    """Median of each electrode's last three fresh values; repeated ones are not fresh."""
 
     def __init__(self, shape: tuple[int, int]) -> None:
         """`shape` is (fingers, 24)."""
@@ -72,9 +72,9 @@ class FreshMedian:
     def push(self, counts: NDArray[np.uint16], usable: NDArray[np.bool_] | None) -> None:
         """Take in one sweep, shape (fingers, 24).
 
-        `usable`: False for electrodes whose fresh values start again; None: all can be used. A
-        value that repeats the last one is not fresh. A third equal value is fresh, because data
-        of a palm at 71.43 Hz never repeat twice.
+        `usable`: False for electrodes to ignore, whose fresh values are forgotten; None: all can
+        be used. A value that repeats the last one is not fresh. A third equal value is fresh,
+        because data of a palm at 71.43 Hz never repeat twice.
         """
         oldest, middle, newest = self._fresh
         fresh = (counts != self._last) | self._held
@@ -102,7 +102,7 @@ class FreshMedian:
         usable: NDArray[np.bool_] | None,
         fresh: NDArray[np.bool_],
     ) -> None:
-        """Count the fresh values, and fill `_fresh` with the first one until there are three."""
+        """Count each electrode's fresh values; the first one stands for those still missing."""
         if usable is not None:
             self._number[~usable] = 0
         first = fresh & (self._number == 0)
@@ -121,7 +121,7 @@ class FingerWord:
     """Time since which the finger moves. None: it does not."""
 
     def touch(self, t_ns: int, moves: bool | None) -> FingerState | None:
-        """Return the state at `t_ns` of a finger that touches.
+        """Return the state at `t_ns` of a finger that touches; None if `moves` is None.
 
         `moves`: True if it moves more than a finger that holds; None: not known.
         """
@@ -293,7 +293,8 @@ class HandTracker:
         return feelings
 
     def _follow_time(self, t_ns: int) -> None:
-        """Forget the state that a usable reading of `t_ns` does not continue."""
+        """Have the grasp settle again if the usable reading of `t_ns` comes after a gap; after an
+        outage, forget the tare and the noise too."""
         last_ns = self._last_ns
         if last_ns is not None and not -OUTAGE_NS <= t_ns - last_ns <= OUTAGE_NS:
             self._contact.forget()

@@ -160,7 +160,7 @@ class Health:
         return findings
 
     def _compare(self, counts: NDArray[np.uint16]) -> NDArray[np.bool_]:
-        """Compare counts with those before; return which are at a rail."""
+        """Note which counts changed or jumped since the last reading; return those at a rail."""
         previous = self._previous
         self._number += 1
         above = self._above
@@ -185,8 +185,8 @@ class Health:
         return railed
 
     def _recurs(self, counts: NDArray[np.uint16], sound: NDArray[np.bool_] | None) -> bool:
-        """Take in a sweep, shape (fingers, 24). Return True if some finger sent it before. `sound`:
-        True for counts that were read; None: all were."""
+        """Take in a sweep, shape (fingers, 24). Return True if some finger repeats one of its last
+        `SWEEPS`. `sound`: True for counts that were read; None: all were."""
         past, place = self._past, self._number % SWEEPS
         now = kept = counts.T
         if sound is not None:

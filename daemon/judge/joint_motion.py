@@ -25,7 +25,7 @@ FROZEN_NS = 1_000_000_000
 The noise of a Hall sensor is one count, so even a single joint changes many times in it.
 """
 ANGLES = 16
-"""Number of readings of a set that are kept for a window. Faster readings are thinned out."""
+"""Number of readings of a set of joints that are kept per window; others are left out."""
 LOST_MAX = 64
 """Most names of lost joints that are remembered; a hand has 24 joints."""
 SOURCES_MAX = 8

@@ -18,7 +18,7 @@ CREEP_COUNTS_PER_S, CREEP_SPREAD = 7.5, 0.67
 and standard deviation of that speed's logarithm. Both were measured on 44 held touches of one
 sensor, in windows of 50 to 240 ms."""
 FAST_SHARE = 0.1
-"""Share of the false alarms that the short window may have where the long one decides."""
+"""Share of the false alarms that the short window may cause if the long one is used too."""
 LOOSE_SHARE = 0.1
 """Share of `false_alarms` in which noise and creep alone pass the loose limit. The pressure of a
 real hold wanders as well; with it the limit is passed in `false_alarms` of the time."""
@@ -30,13 +30,16 @@ class Tails(NamedTuple):
     slow: float
     """In the long window."""
     fast: float
-    """In the short window where the long one decides."""
+    """In the short window, if the long one is used too."""
     alone: float
-    """In the short window where it decides alone."""
+    """In the short window, if it decides alone."""
 
     @classmethod
     def of(cls, fingers: int, false_alarms: float, *, early: bool) -> Tails:
-        """Return the tails for `false_alarms`, 0..0.5. Raises `ValueError` for another share."""
+        """Return the tails for a share of `false_alarms`, above 0 and below 0.5.
+
+        `early`: the short window may decide alone. Raises `ValueError` for another share.
+        """
         if not 0.0 < false_alarms < 0.5:
             raise ValueError(f"false_alarms is {false_alarms}, must be between 0 and 0.5")
         finger = 1.0 - (1.0 - false_alarms) ** (1.0 / fingers)
@@ -45,14 +48,14 @@ class Tails(NamedTuple):
 
 
 class SlowNoise(NamedTuple):
-    """Noise in the long window."""
+    """Spread of the counts that noise alone gives in the long window, by finger."""
 
     extent: float
     """Sum of the squares of the window's times, counted from their mean, s**2."""
     squares: list[float]
-    """Sum of the squares of each finger's noise, counts**2."""
+    """Sum over the window of an electrode's squared deviations from its mean, counts**2."""
     spreads: list[float]
-    """Values of `Noise.spread`."""
+    """`Noise.spread` for the window's number of steps."""
 
 
 class MotionLimits:
@@ -112,8 +115,8 @@ def creep(tail: float) -> float:
 
 
 def _usual(tail: float) -> tuple[float, float]:
-    """Return a finger's mean absolute slopes at `tail`: by noise, in units of the noise; by creep,
-    counts/s."""
+    """Return two mean absolute slopes of a finger, `tail` standard deviations above the usual one:
+    by noise, in units of the noise, and by creep, counts/s."""
     return math.exp(SLOPE_SPREAD * tail), MEAN_ABS * creep(tail)
 
 

@@ -138,7 +138,7 @@ class Pipeline:
         return self.hand.on_request
 
     def session_then(self) -> SessionState | None:
-        """Return the session's state as if the grasp that is held were over."""
+        """Return the session's state as if the current grasp were over; None: no session."""
         session = self.session
         if session is None:
             return None
@@ -187,7 +187,7 @@ class Pipeline:
             self.on_exchange(known)
 
     def outcome(self, grasp: GraspId, *, slipped: bool) -> OutcomeStatus:
-        """Take in how the lift of a grasp has ended; takes 0.5 to 1 ms."""
+        """Note how the lift of a grasp ended; return what came of it. Takes 0.5 to 1 ms."""
         if self.trust is not None:
             return self.trust.outcome(grasp, slipped=slipped)
         return self.lifts.tell(grasp, slipped=slipped)[0]

@@ -59,7 +59,7 @@ class Reason(StrEnum):
     MODEL_MISMATCH = "model-mismatch"
     MODEL_FAILED = "model-failed"
     HEARD_LATE = "heard-late"
-    """Only in `health`."""
+    """Only a problem in `health`, never a reason of a verdict."""
 
 
 ADVICE: dict[Reason, str] = {
@@ -128,11 +128,11 @@ NEEDS = {
     Reason.NOT_CALIBRATED: Need.WAIT,
     Reason.UNPROVEN: Need.WAIT,
 }
-"""Reasons that are not `Need.ACT`."""
+"""Need of each reason; of reasons that are not here, it is `Need.ACT`."""
 
 
 def need_of(reasons: Iterable[Reason]) -> Need:
-    """Return the most urgent need of several reasons."""
+    """Return the most urgent need of several reasons; `NORMAL` without any."""
     needs = {NEEDS.get(reason, Need.ACT) for reason in reasons}
     return next((need for need in reversed(Need) if need in needs), Need.NORMAL)
 
@@ -154,7 +154,7 @@ UNREADABLE = frozenset(
 )
 """Reasons for which the sensors cannot be read, so that the state of the hand is not known."""
 FOLLOWING = {*NEEDS, Reason.JOINTS_LATE}
-"""Reasons that last until readings come: without any, there is nothing to do about them."""
+"""Reasons that last while no readings come: until then there is nothing to do about them."""
 _ORDER = {reason: (reason in NEEDS, place) for place, reason in enumerate(Reason)}
 """Sort key of each reason: as in `Reason`, but those that are not `Need.ACT` come last."""
 WATCHED_LIFT = frozenset({Reason.LOW_CONFIDENCE, Reason.UNPROVEN})
@@ -207,7 +207,7 @@ class GateState(StrEnum):
     JUDGED = "judged"
     """The verdict stands, and is refreshed while readings confirm that the grasp is the same."""
     RELEASED = "released"
-    """Nothing touches since less than `RELEASE_NS` of the gate; a new touch may follow."""
+    """The last finger let go less than `RELEASE_NS` of the gate ago; a new touch may follow."""
 
 
 OPEN = frozenset({GateState.IDLE, GateState.RELEASED})
@@ -233,7 +233,7 @@ class GateCause(StrEnum):
     JUDGED = "judged"
     MOVED = "moved"
     CHANGED = "changed"
-    """The grasp is another than the one that was judged."""
+    """The grasp is no longer the one that was judged."""
     CONTACT_LOST = "contact-lost"
     GAP = "gap"
     """No usable reading for too long."""

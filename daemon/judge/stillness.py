@@ -141,7 +141,7 @@ class StepRing:
         self.usable_since_ns.fill(t_ns)
 
     def find_lost(self, usable: Usable | None) -> Usable | None:
-        """Return the electrodes unusable for over `LOST_MAX` sweeps. `usable` None: all are."""
+        """Return the electrodes unusable for over `LOST_MAX` sweeps; None if `usable` is None."""
         if usable is None:
             self._lost.fill(0)
             return None
@@ -151,7 +151,7 @@ class StepRing:
         return gone
 
     def lose(self, gone: Usable, t_ns: int) -> None:
-        """Count the electrodes `gone` as unusable until the end of the step at `t_ns`."""
+        """Count the electrodes `gone` as unusable until `STEP_NS` after `t_ns`."""
         self._all_usable_since_ns = t_ns + STEP_NS
         self.usable_since_ns[gone] = t_ns + STEP_NS
 
@@ -234,7 +234,7 @@ class NoiseBlocks:
         self._noise = None
 
     def learn(self, ring: StepRing) -> None:
-        """Take in the step that has just ended."""
+        """Take in the last step of `ring`, which has just ended."""
         if len(ring.times_ns) <= APART:
             return
         self._pending += 1
@@ -263,7 +263,7 @@ class NoiseBlocks:
             sums += ((np.square(differences) * usable) @ ONES / numbers).sum(axis=0)
 
     def noise(self) -> Noise:
-        """Return the motion that noise alone seems to show, from `BLOCKS_MIN` blocks or more."""
+        """Return the motion that noise alone seems to show. Needs at least one finished block."""
         if self._noise is None:
             number = min(self.number, BLOCKS)
             squares = np.sort(self._blocks[:number], axis=0)[number // 4]
@@ -285,10 +285,10 @@ class Motion:
     """
 
     def __init__(self, fingers: int, false_alarms: float, *, early: bool = False) -> None:
-        """`false_alarms`: share of a settled hand's sweeps that may pass the loose limit, 0..0.5.
+        """`false_alarms`: share of a settled hand's sweeps that may pass the loose limit.
 
-        With `early` the short window alone may have the same share. Raises `ValueError` for
-        another share.
+        `early`: the short window may decide alone, with the same share. Raises `ValueError` for a
+        share that is not above 0 and below 0.5.
         """
         shape = (fingers, ELECTRODES)
         self.spikes = SpikeFilter(shape)

@@ -50,7 +50,7 @@ for _number in range(STEPS_MIN, STEPS + 1):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Noise:
-    """Motion of each finger that noise alone seems to show, by the number of a window's steps."""
+    """Motion that noise alone seems to show, by a window's number of steps, then by finger."""
 
     slope: list[list[float]]
     """Mean absolute slope times the square root of the sum of squared times, counts.
