@@ -25,7 +25,7 @@ def require_linux(what: str) -> None:
 
 
 def open_flags(flags: int, *names: str) -> int:
-    """Return flags for `os.open` of a binary file: `flags`, and those that this system has."""
+    """Return `flags` for `os.open` of a binary file, and those of `names` that this system has."""
     for name in ("O_BINARY", "O_CLOEXEC", *names):
         flags |= getattr(os, name, 0)
     return flags
@@ -67,7 +67,7 @@ def write_atomically(path: Path, content: bytes, mode: int = 0o600) -> None:
 
 
 def sync_folder(path: Path) -> None:
-    """Let the names in a folder last through a power cut, where the system can do that."""
+    """Make changes of file names in a folder survive a power cut, where the system can do that."""
     if not hasattr(os, "O_DIRECTORY"):
         return
     folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)

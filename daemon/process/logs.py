@@ -17,11 +17,11 @@ BURST = 10
 """Most messages of one kind in a window; a fault must not fill the journal."""
 WINDOW_S = 60.0
 KINDS_MAX = 200
-"""Most kinds of messages that are counted; the code has fewer."""
+"""Most kinds of messages that are counted; the code has fewer. Further kinds are not limited."""
 
 
 def set_up(environment: Mapping[str, str]) -> None:
-    """Log to stderr, with priorities if `environment` names the journal."""
+    """Log to stderr, with priorities if it is the journal's stream that `environment` names."""
     handler = logging.StreamHandler()
     plain = logging.Formatter("graspd: %(levelname)s: %(message)s")
     handler.setFormatter(JournalFormatter() if is_journal(environment) else plain)
@@ -61,7 +61,7 @@ class RateLimit(logging.Filter):
         """Start of the window, s, number of messages in it, and limit, by kind."""
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Return True to pass a message; the first in a window gets the number held back before."""
+        """Return True to pass a message. To the first in a window, add how many were held back."""
         now_s, kind = self._clock(), f"{record.name} {record.msg}"
         if kind not in self._kinds and len(self._kinds) >= KINDS_MAX:
             return True

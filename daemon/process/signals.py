@@ -23,7 +23,7 @@ def stopping() -> list[signal.Signals]:
 
 
 class StopSignal:
-    """Handler that records the first signal that stops the process."""
+    """Handler that records the last signal that asked the process to stop."""
 
     def __init__(self) -> None:
         self.received: signal.Signals | None = None
@@ -38,7 +38,7 @@ class StopSignal:
         return self._read.fileno()
 
     def wait(self, seconds: float) -> bool:
-        """Wait up to `seconds` for a signal; return True if one has stopped the process."""
+        """Wait up to `seconds` for a signal; return True if one asked to stop, now or before."""
         with selectors.DefaultSelector() as selector:
             selector.register(self._read, selectors.EVENT_READ)
             selector.select(seconds)
@@ -47,7 +47,7 @@ class StopSignal:
         return self.received is not None
 
     def __enter__(self) -> Self:
-        """Take over the signals. Only the main thread can."""
+        """Handle the signals until `__exit__`. Only the main thread can."""
         self._former_wakeup = signal.set_wakeup_fd(self._write.fileno(), warn_on_full_buffer=False)
         self._former = {signum: signal.signal(signum, self._handle) for signum in stopping()}
         return self

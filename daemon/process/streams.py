@@ -17,8 +17,8 @@ FAILED = 1
 def guarded(command: Callable[[], int]) -> int:
     """Run a command whose standard output may fail; return its exit code.
 
-    It is 0 if the reader has closed the pipe, as in `graspd replay | head`. If writing fails, it is
-    1, with a line on stderr. Characters that the encoding lacks are escaped.
+    The code is 0 if the reader has closed the pipe, as in `graspd replay | head`, and 1, with a
+    line on stderr, if writing fails otherwise. Characters that the encoding lacks are escaped.
     """
     raw = _take_over()
     try:
@@ -53,7 +53,7 @@ class _Raw(io.FileIO):
 
 
 def _take_over() -> _Raw:
-    """Replace `sys.stdout`, and `sys.stderr` if it is closed."""
+    """Replace `sys.stdout`, and `sys.stderr` if it is closed; return the stream below stdout."""
     former = sys.stdout
     if isinstance(former, io.TextIOWrapper):
         descriptor = former.fileno()
@@ -74,7 +74,7 @@ def _take_over() -> _Raw:
 
 
 def _discard(raw: _Raw) -> None:
-    """Discard the buffer, so that the interpreter does not write it again at its end."""
+    """Direct the stream to nowhere, so that the interpreter's flush at its end cannot fail."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, raw.fileno())
     os.close(nowhere)

@@ -21,7 +21,7 @@ class Colour(IntEnum):
 
 
 def coloured(text: str, colour: Colour) -> str:
-    """Return coloured text if stdout shows colours (https://no-color.org)."""
+    """Return coloured text if stdout shows colours (https://no-color.org), else `text`."""
     if not sys.stdout.isatty() or os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
         return text
     return f"\x1b[{colour.value}m{text}\x1b[0m"

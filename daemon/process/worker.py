@@ -53,7 +53,7 @@ class Worker(Generic[R]):
         return True
 
     def take(self, wait_s: float = 0.0) -> R | Exception | None:
-        """Return the job's result or exception; None without one or if it still runs."""
+        """Wait up to `wait_s` for the job; return its result or exception. None: none has ended."""
         if not self.busy:
             return None
         poll = select.poll()
