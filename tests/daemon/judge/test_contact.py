@@ -65,7 +65,7 @@ def test_a_finger_touches_and_lets_go_by_its_fall(story: Story) -> None:
     ("deep", "relative", "touches"),
     [(20.0, 20.0, True), (19.99, 99.0, False), (99.0, 19.99, False)],
 )
-def test_a_touch_falls_below_baseline_and_finger(
+def test_a_touch_needs_a_fall_below_baseline_and_median_electrode(
     deep: float, relative: float, touches: bool
 ) -> None:
     touch = Touch(THRESHOLD)
@@ -143,7 +143,7 @@ def rested(fingers: int = 1) -> tuple[Contact, Counts]:
     return contact, rest
 
 
-def test_a_window_is_checked_after_100_sweeps_then_every_25() -> None:
+def test_a_tare_comes_after_100_untouched_sweeps_then_every_25() -> None:
     contact, looks = Contact(1), []
     for place in range(1, 320):
         counts = pressed(REST, 10 if place == 160 else 0)  # half of a touch
@@ -153,7 +153,7 @@ def test_a_window_is_checked_after_100_sweeps_then_every_25() -> None:
     assert looks == [100, 125, 150, 260, 285, 310], "a hundred sweeps after what looked as a touch"
 
 
-def test_a_finger_alone_for_half_a_minute_is_tared_again() -> None:
+def test_a_finger_touching_alone_for_30_s_is_tared_again() -> None:
     contact, rest = rested(2)
     both = pressed(rest, 200)
     one = np.concatenate((both[:1], rest[1:]))
@@ -164,7 +164,7 @@ def test_a_finger_alone_for_half_a_minute_is_tared_again() -> None:
     assert contact.tared == [False, True], "half a minute since it was left alone"
 
 
-def test_a_holds_depth_fades_by_time() -> None:
+def test_hold_depth_fades_by_5_counts_per_second() -> None:
     contact, rest = rested()
     for t_ns, fall in ((1 * S, 200), (2 * S, 100)):
         counts = pressed(rest, fall)
@@ -172,7 +172,7 @@ def test_a_holds_depth_fades_by_time() -> None:
     assert contact.touches[0].depth == 195.0
 
 
-def test_the_third_deepest_electrode_makes_the_touch() -> None:
+def test_two_fallen_electrodes_are_not_a_touch_and_three_are() -> None:
     contact, rest = rested()
     for fallen in (2, 3):
         counts = rest.copy()
@@ -208,7 +208,9 @@ def test_fewer_than_twelve_usable_electrodes_never_touch(number: int) -> None:
         (sweeps_of(3000 + 0.12 * sweep for sweep in range(125)), None),  # 6 from half to half
     ],
 )
-def test_a_finger_rests_that_neither_wavers_nor_rises(sweeps: Sweeps, sigma: float | None) -> None:
+def test_only_a_finger_with_little_noise_and_drift_is_tared(
+    sweeps: Sweeps, sigma: float | None
+) -> None:
     rest = rest_of(sweeps)
     assert (rest is None) == (sigma is None)
     if rest is not None and sigma is not None:
@@ -217,7 +219,7 @@ def test_a_finger_rests_that_neither_wavers_nor_rises(sweeps: Sweeps, sigma: flo
 
 
 @pytest.mark.parametrize(("usable", "known"), [(24, 24), (12, 12), (11, None)])
-def test_twelve_electrodes_make_a_tare(usable: int, known: int | None) -> None:
+def test_a_tare_needs_twelve_usable_electrodes(usable: int, known: int | None) -> None:
     rest = rest_of(wavering(2), usable)
     assert (None if rest is None else int(rest[2].sum())) == known
 
@@ -229,7 +231,9 @@ def test_twelve_electrodes_make_a_tare(usable: int, known: int | None) -> None:
         *((2980, 3020, True), (2979, 3021, False)),  # sigma 29.7 or 31.1, the limit is 30
     ],
 )
-def test_an_electrode_at_a_rail_or_noisier_has_no_rest(low: int, high: int, known: bool) -> None:
+def test_electrodes_at_a_rail_or_too_noisy_have_no_baseline(
+    low: int, high: int, known: bool
+) -> None:
     sweeps = wavering(2)
     for place, sweep in enumerate(sweeps):
         sweep[5] = (low, high)[place % 2]
@@ -242,7 +246,7 @@ def test_an_electrode_at_a_rail_or_noisier_has_no_rest(low: int, high: int, know
     ("step", "threshold"),
     [(2, 20.0), (4, 5 * 4 * 1.4826)],  # 5 sigmas are 14.8, and 29.7
 )
-def test_a_touch_takes_five_sigmas_or_twenty_counts(step: int, threshold: float) -> None:
+def test_touches_need_the_larger_of_five_sigmas_and_20_counts(step: int, threshold: float) -> None:
     contact = Contact(1)
     for place, counts in enumerate(wavering(step)):
         contact.observe(place * PERIOD_NS, counts[None], counts[None], None)
@@ -310,7 +314,9 @@ def as_sampled(recorded: Counts, changed: NDArray[np.int64]) -> Counts:
 
 
 @pytest.mark.parametrize("direction", [1, -1], ids=["forward", "backward"])
-def test_a_real_untouched_recording_touches_nothing(untouched: Counts, direction: int) -> None:
+def test_no_finger_touches_in_a_real_recording_of_untouched_sensors(
+    untouched: Counts, direction: int
+) -> None:
     hand = Hand()
     played = np.tile(untouched[::direction], (5, 1, 1))
     assert not hand.play(played[:100]).any()

@@ -75,7 +75,7 @@ def expected(
 
 
 @pytest.mark.parametrize("limits", [LIMITS, ANY_CONFIDENCE])
-def test_every_combination_is_judged_by_the_rule(limits: Limits) -> None:
+def test_every_combination_of_inputs_gets_the_verdict_of_the_rule(limits: Limits) -> None:
     assert len(CASES) == 16 * 6 * 3 * 3 * 2 * 2 * 2 * 3
     for case_of in CASES:
         (p_slip, worth), (age_ns, fresh), health, gate, contact, settled, withheld, doubt = case_of
@@ -101,7 +101,7 @@ def test_any_reason_makes_the_verdict_unknown(where: str) -> None:
         assert decide(0.0, health, moment, 0, LIMITS) == (Decision.UNKNOWN, (reason,))
 
 
-def test_by_default_only_more_than_100_ms_is_stale() -> None:
+def test_by_default_a_reading_older_than_100_ms_is_stale() -> None:
     for p_slip, age_ns, wanted in (
         (0.499999, 100_000_000, (Decision.STABLE, ())),
         (0.5, 100_000_000, (Decision.SLIP, ())),

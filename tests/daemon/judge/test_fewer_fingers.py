@@ -38,7 +38,7 @@ def verdicts_of(text: str) -> list[Verdict]:
 
 
 @pytest.mark.parametrize("name", HANDS)
-def test_a_table_of_fewer_fingers_gets_the_same_verdicts(name: str, tmp_path: Path) -> None:
+def test_a_table_without_unused_fingers_gets_the_same_verdicts(name: str, tmp_path: Path) -> None:
     part = graspd("replay", cut(DEMO_TABLE, HANDS[name], tmp_path), "--model", name, "--json")
     whole = graspd("replay", DEMO_TABLE, "--model", name, "--json")
     assert part.returncode == whole.returncode == 0, part.stderr

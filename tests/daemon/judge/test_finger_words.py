@@ -61,7 +61,7 @@ def words(told: Told, finger: Finger) -> list[str]:
     return [said[0], *(word for former, word in pairwise(said) if word != former)]
 
 
-def test_the_words_follow_a_grasp_from_rest_to_release() -> None:
+def test_finger_states_follow_a_grasp_from_rest_to_release() -> None:
     told = felt(SLIPPING)
     assert words(told, "ff") == ["unknown", "free", "slide", "touch", "slide", "touch"]
     assert words(told, "mf") == ["unknown", "free", "slide", "touch"]
@@ -73,7 +73,7 @@ def test_the_words_follow_a_grasp_from_rest_to_release() -> None:
     assert {state for t_s, state, _ in told if 1.15 < t_s < 1.3} == {GateState.JUDGED}
 
 
-def test_motion_of_a_still_finger_must_last() -> None:
+def test_a_still_finger_slides_only_after_lasting_motion() -> None:
     finger = FingerWord()
     moves = [True, True, False, True, True, True, False, True, None, True]
     told = [finger.touch(place * 10 * MS, each) for place, each in enumerate(moves)]
@@ -83,25 +83,25 @@ def test_motion_of_a_still_finger_must_last() -> None:
     assert FingerWord(was_still=True, moves_since_ns=50).touch(49, True) is SLIDE, "time went back"
 
 
-def test_a_word_is_told_once_both_windows_are_known() -> None:
+def test_a_finger_state_is_known_once_both_windows_are_full() -> None:
     known = [feelings for t_s, _, feelings in felt(FIRM, restart_s=1.0) if t_s > 1.0 - 1e-6]
     # The long window is full by the 25th sweep.
     assert known == [UNKNOWN] * 24 + [HELD] * (len(known) - 24)
 
 
-def test_fast_motion_is_told_before_the_long_window_is_known() -> None:
+def test_a_fast_finger_slides_before_the_long_window_is_full() -> None:
     told = [feelings for t_s, _, feelings in felt(SLIPPING, restart_s=2.15) if t_s < 2.295]
     assert told[-1] == {"ff": None, "mf": None, "th": SLIDE}
 
 
 @pytest.mark.parametrize("reason", [Reason.SENSOR_MISSING, Reason.FROZEN, Reason.PARITY])
-def test_a_reading_that_cannot_be_used_tells_nothing(reason: Reason) -> None:
+def test_no_finger_state_is_known_in_an_unusable_reading(reason: Reason) -> None:
     told = felt(FIRM, check=lambda t_s: Checked((reason,) * (abs(t_s - 1.2) < 1e-6), None))
     around = [feelings for t_s, _, feelings in told if abs(t_s - 1.2) < 0.015]
     assert around == [HELD, UNKNOWN, HELD]
 
 
-def test_a_finger_of_few_electrodes_hides_no_other() -> None:
+def test_only_a_finger_with_few_usable_electrodes_is_unknown() -> None:
     lost = ~ALL
     lost[1, :13] = True
     told = felt(FIRM, check=lambda t_s: Checked((), lost if t_s > 1.0 else None))
@@ -109,7 +109,7 @@ def test_a_finger_of_few_electrodes_hides_no_other() -> None:
 
 
 @pytest.mark.parametrize(("late_ms", "is_known"), [(100, True), (101, False)])
-def test_an_old_reading_tells_nothing(late_ms: int, is_known: bool) -> None:
+def test_a_reading_older_than_100_ms_gives_no_finger_state(late_ms: int, is_known: bool) -> None:
     now_ns = late_ns = 0
     model = TactileModel(zoo.find("cnn1"))
     judge = Pipeline(model, FINGERS, Limits(), lambda: now_ns, hand=LIMITS, learns=False)

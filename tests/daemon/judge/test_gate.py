@@ -178,7 +178,7 @@ def test_the_gate_follows_each_scenario(scenario: Scenario) -> None:
         assert earliest <= (settled_ns - START_NS) / 1e9 <= latest
 
 
-def test_the_wire_page_has_all_transitions() -> None:
+def test_the_wire_readme_lists_all_transitions_of_the_gate() -> None:
     page = (ROOT / "deploy" / "wire" / "README.md").read_text()
     assert "\n".join(phase.lines()) in page
 
@@ -187,7 +187,7 @@ FIRM = Scenario("firm", GRASPED, UP)
 SOUND = Checked((), ~ALL)
 
 
-def test_after_a_gap_three_fresh_sweeps_are_judged() -> None:
+def test_after_a_gap_only_counts_of_later_sweeps_are_judged() -> None:
     hasty = replace(LIMITS, gate=replace(GATE, early=True))
     gap = replace(FIRM, missing=(0.505, 0.745), limits=hasty)
     after = [reading.counts for t_s, reading in readings(gap) if t_s > 0.745]
@@ -231,7 +231,7 @@ def test_a_finger_that_need_not_touch_need_not_be_tared() -> None:
         ((0.395, 1.395), False, ()),  # more than a second: they may be others
     ],
 )
-def test_sensors_away_have_the_grasp_settle_or_are_tared_again(
+def test_a_gap_unsettles_the_grasp_an_outage_forgets_the_tare(
     missing: tuple[float, float], is_gap: bool, tared: tuple[str, ...]
 ) -> None:
     played = play(replace(FIRM, missing=missing))
@@ -240,7 +240,7 @@ def test_sensors_away_have_the_grasp_settle_or_are_tared_again(
 
 
 @pytest.mark.parametrize(("back_ns", "tared"), [(10**9, FINGERS), (10**9 + 1, ())])
-def test_after_time_went_back_a_second_sensors_may_be_others(
+def test_time_that_goes_back_over_one_second_forgets_the_tare(
     back_ns: int, tared: tuple[str, ...]
 ) -> None:
     """Time goes back if the later of two recordings is played first."""
@@ -256,7 +256,7 @@ def test_after_time_went_back_a_second_sensors_may_be_others(
     assert known == [finger in tared for finger in FINGERS]
 
 
-def test_joints_are_lost_when_readings_continue_without_them() -> None:
+def test_the_health_reports_required_joints_that_send_no_angles() -> None:
     silent = Scenario("no joints", GRASPED, UP, limits=replace(LIMITS, joints=True))
     assert "joints" not in HandTracker(FINGERS, silent.limits).health(), "nothing came yet"
     assert play(silent).hand.health()["joints"] is Reason.JOINTS_LATE
@@ -264,7 +264,7 @@ def test_joints_are_lost_when_readings_continue_without_them() -> None:
     assert "joints" not in play(replace(silent, limits=LIMITS)).hand.health(), "not required"
 
 
-def test_the_window_nearer_its_limit_is_reported() -> None:
+def test_the_reported_motion_is_of_the_window_nearer_its_limit() -> None:
     hand, alone, told = HandTracker(FINGERS, LIMITS), Motion(3, GATE.false_alarms), set()
     for _, reading in readings(FIRM):
         felt, _ = hand.step(reading.made_ns, reading.counts, SOUND)

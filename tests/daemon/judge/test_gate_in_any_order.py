@@ -314,7 +314,7 @@ class Readings(RuleBasedStateMachine):
 
 @pytest.mark.parametrize("early", [False, True])
 @pytest.mark.parametrize("on_request", [False, True])
-def test_the_gate_in_any_order_is_as_the_model(
+def test_the_gate_agrees_with_its_model_on_random_sequences(
     monkeypatch: pytest.MonkeyPatch, on_request: bool, early: bool
 ) -> None:
     monkeypatch.setattr(Readings, "early", early, raising=False)

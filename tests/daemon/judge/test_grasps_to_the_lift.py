@@ -32,7 +32,7 @@ STANDS_S = 0.03
 
 
 @pytest.mark.parametrize("held", [True, False], ids=["71.43 Hz held", "100 Hz fresh"])
-def test_each_grasp_is_judged_once_still_and_before_its_lift(
+def test_each_still_grasp_is_judged_exactly_once_before_its_lift(
     bts3_dir: Path, untouched: NDArray[np.uint16], held: bool
 ) -> None:
     """Sweeps are those of a palm's recording, or of an SPI bridge."""

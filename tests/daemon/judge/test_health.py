@@ -37,7 +37,7 @@ def broken_of(checked: Checked) -> NDArray[np.bool_]:
     return np.zeros((3, 24), np.bool_) if checked.broken is None else checked.broken
 
 
-def test_first_low_counts_are_not_a_jump() -> None:
+def test_the_first_reading_is_never_counted_as_a_jump() -> None:
     health = Health(len(FINGERS))
     counts = np.full((3, 24), 5)
     for place in range(3):  # two jumps more would be enough
@@ -82,7 +82,7 @@ def steps_of(sweeps: int, jumps: dict[int, int], movers: int = 1, by: int = 0) -
         ({0: 151, 1: -151, 8: 151}, False),  # 1.91
     ],
 )
-def test_more_than_two_jumps_above_a_spike_flag_an_electrode(
+def test_three_recent_jumps_higher_than_a_spike_flag_an_electrode(
     jumps: dict[int, int], jumpy: bool
 ) -> None:
     found = watched(steps_of(max(jumps) + 1, jumps))
@@ -94,7 +94,7 @@ def test_more_than_two_jumps_above_a_spike_flag_an_electrode(
 
 @pytest.mark.parametrize(("movers", "by", "jumpy"), [(4, 31, True), (5, 31, False), (5, 30, True)])
 @pytest.mark.parametrize("sign", [1, -1])
-def test_an_electrode_jumps_while_the_others_keep_still(
+def test_a_jump_counts_only_while_twenty_others_keep_still(
     movers: int, by: int, jumpy: bool, sign: int
 ) -> None:
     """A touch moves more than four electrodes by more than 30 counts."""
@@ -129,7 +129,7 @@ def test_an_electrode_unchanged_for_16_readings_is_dead() -> None:
         ((24, 24, 24), True),
     ],
 )
-def test_more_than_twelve_or_eight_broken_electrodes_are_too_many(
+def test_over_12_broken_electrodes_or_8_per_finger_are_refused(
     broken: tuple[int, ...], found: bool
 ) -> None:
     railed = np.array([np.arange(24) < number for number in broken])
@@ -140,7 +140,7 @@ def test_more_than_twelve_or_eight_broken_electrodes_are_too_many(
 @pytest.mark.parametrize(
     ("count", "railed"), [(0, True), (1, False), (4094, False), (4095, True), (65535, True)]
 )
-def test_rails_are_broken_and_their_neighbours_are_not(count: int, railed: bool) -> None:
+def test_only_counts_at_or_beyond_a_rail_are_broken(count: int, railed: bool) -> None:
     counts = np.full((3, 24), 2000)
     counts[2, 7] = count
     health = Health(len(FINGERS))
@@ -155,7 +155,7 @@ def flat(count: int) -> TactileReading:
 
 
 @pytest.mark.parametrize("flag", [ElectrodeFault.HELD, ElectrodeFault.CUT_OFF])
-def test_an_unusable_reading_is_remembered_as_an_old_sweep(flag: int) -> None:
+def test_a_sweep_that_repeats_an_unusable_one_is_frozen(flag: int) -> None:
     health, reasons = Health(len(FINGERS)), []
     for count, bits in [(2000, flag), (2001, 0), (2002, 0), (2000, 0)]:
         reading = flat(count)
@@ -173,7 +173,7 @@ def test_an_unusable_reading_is_remembered_as_an_old_sweep(flag: int) -> None:
         (64, (Reason.ERROR_WORD,)),
     ],
 )
-def test_a_fault_of_more_than_electrodes_refuses_the_reading(
+def test_only_a_fault_of_the_whole_reading_makes_it_unusable(
     flags: int, reasons: tuple[Reason, ...]
 ) -> None:
     health, reading = Health(len(FINGERS)), flat(2000)
@@ -187,7 +187,7 @@ def test_a_fault_of_more_than_electrodes_refuses_the_reading(
 
 
 @pytest.mark.parametrize(("sweeps", "live"), [(2, 0), (64, 4), (128, 0), (129, 0)])
-def test_a_ring_of_128_sweeps_is_frozen_from_its_repeat(sweeps: int, live: int) -> None:
+def test_cycles_of_up_to_128_sweeps_are_frozen_when_repeated(sweeps: int, live: int) -> None:
     """The first `live` electrodes differ by one count from turn to turn."""
     health = Health(len(FINGERS))
     old = np.random.default_rng(2).integers(500, 3500, (sweeps, 3, 24))
@@ -199,7 +199,7 @@ def test_a_ring_of_128_sweeps_is_frozen_from_its_repeat(sweeps: int, live: int) 
 
 
 @pytest.mark.parametrize("packets", [15, 896])
-def test_a_ring_of_odd_palm_packets_is_never_stable(packets: int) -> None:
+def test_repeating_the_same_palm_packets_is_never_stable(packets: int) -> None:
     """Where it restarts a packet is lost, or two contradict each other: a round lacks those."""
     clock, stream = Clock(), PalmStream(FINGERS)
     model = TactileModel(zoo.find("cnn1"))
@@ -232,7 +232,7 @@ def test_a_ring_of_odd_palm_packets_is_never_stable(packets: int) -> None:
         (11, 13, False),  # fewer than 12 that were read
     ],
 )
-def test_a_sweep_of_twenty_equal_or_unread_electrodes_comes_again(
+def test_twenty_equal_or_unread_electrodes_make_a_repeated_sweep(
     equal: int, unread: int, is_frozen: bool
 ) -> None:
     health, random = Health(len(FINGERS)), np.random.default_rng(4)
@@ -247,7 +247,7 @@ def test_a_sweep_of_twenty_equal_or_unread_electrodes_comes_again(
 
 
 @pytest.mark.parametrize("faulty", ["always the same", "another each time", "at first", "later"])
-def test_an_electrode_that_is_not_read_hides_no_ring(faulty: str) -> None:
+def test_repeated_sweeps_are_frozen_despite_electrodes_that_were_not_read(faulty: str) -> None:
     """Its count means nothing, however it is flagged."""
     health, random = Health(len(FINGERS)), np.random.default_rng(1)
     old = random.integers(500, 3500, (9, 3, 24))
@@ -267,7 +267,7 @@ def test_an_electrode_that_is_not_read_hides_no_ring(faulty: str) -> None:
     assert all(Reason.FROZEN in reasons for reasons in said[9:])
 
 
-def test_an_unread_finger_is_missing_and_does_not_recur() -> None:
+def test_an_unread_finger_is_missing_but_not_a_repeated_sweep() -> None:
     health, random = Health(len(FINGERS)), np.random.default_rng(3)
     for _ in range(300):
         reading = sound(random.integers(500, 3500, (3, 24)))
@@ -277,7 +277,7 @@ def test_an_unread_finger_is_missing_and_does_not_recur() -> None:
 
 
 @pytest.mark.parametrize("table", ["palm_45", "palm_down", "palm_side", "untouched"])
-def test_no_real_sweep_comes_again(
+def test_no_sweep_of_a_real_recording_counts_as_a_repeat(
     bts3_dir: Path, untouched: NDArray[np.uint16], table: str
 ) -> None:
     sweeps = untouched if table == "untouched" else recorded_counts(bts3_dir / f"{table}.csv")

@@ -40,7 +40,9 @@ def turning(rate_hz: float, rad_per_s: float, seconds: float = 1.0) -> tuple[Joi
 
 @pytest.mark.parametrize("rate_hz", [10.0, 71.43, 1000.0])
 @pytest.mark.parametrize("rad_per_s", [0.095, -0.095, 0.105, -0.105])
-def test_speed_is_angle_over_time_at_every_rate(rate_hz: float, rad_per_s: float) -> None:
+def test_joints_faster_than_the_limit_are_moving_at_every_rate(
+    rate_hz: float, rad_per_s: float
+) -> None:
     motion, now_ns = turning(rate_hz, rad_per_s)
     assert motion.objection(now_ns) is (Reason.MOVING if abs(rad_per_s) > 0.1 else None)
 
@@ -58,7 +60,7 @@ OTHERS = {"none": (), "a finger": ("THJ1",), "those but one": ("FFJ1", "FFJ3")}
         *((1001, None), (3000, None)),
     ],
 )
-def test_joints_are_late_and_then_lost(
+def test_silent_joints_are_late_after_150_ms_then_lost(
     age_ms: int, reason: Reason | None, others: tuple[str, ...]
 ) -> None:
     motion, last_ns = turning(100.0, 0.0)
@@ -72,7 +74,7 @@ def test_joints_are_late_and_then_lost(
     assert not motion.is_frozen
 
 
-def test_joints_not_yet_there_are_waited_for_a_second() -> None:
+def test_joints_that_have_sent_nothing_are_waited_for_one_second() -> None:
     motion, last_ns = turning(100.0, 0.0)
     for waits, now_ns in ((JointMotion(), START_NS), (motion, last_ns - 151 * MS)):
         for ms, reason in ((0, Reason.JOINTS_LATE), (1000, Reason.JOINTS_LATE), (1001, None)):
@@ -90,7 +92,7 @@ def test_angles_of_one_and_the_same_time_give_no_speed() -> None:
     assert motion.objection(now_ns) is None
 
 
-def test_each_sender_must_be_still() -> None:
+def test_joints_of_every_sender_must_be_still() -> None:
     motion = JointMotion()
     for ms in range(0, 700, 10):
         t_ns = START_NS + ms * MS
@@ -137,7 +139,7 @@ def test_eighteen_angles_a_sixteenth_of_a_window_apart_are_kept(every_ms: float,
     assert steps == {round({5: 5, 4: 8, 2.5: 5, 10: 10}[every_ms] * MS)}
 
 
-def test_a_window_compares_with_its_first_angle() -> None:
+def test_joint_speed_uses_the_first_angle_of_the_window() -> None:
     """By hand: 0.0079 rad in 80 ms are 0.099 rad/s, 0.0081 rad 0.101 rad/s."""
     for moved, reason in ((0.0079, None), (0.0081, Reason.MOVING)):
         motion, now_ns = turning(100.0, 0.0)
@@ -151,7 +153,7 @@ def test_a_window_compares_with_its_first_angle() -> None:
     assert found is None, "it moved 90 ms ago"
 
 
-def test_eight_senders_are_kept_apart_and_a_ninth_restarts() -> None:
+def test_eight_sets_of_joints_are_followed_a_ninth_clears_them() -> None:
     motion = JointMotion()
     for sender in range(8):
         send(motion, START_NS, 1.0, names=(f"J{sender}",))
@@ -162,7 +164,7 @@ def test_eight_senders_are_kept_apart_and_a_ninth_restarts() -> None:
     assert set(motion.past) == set(motion.latest_ns) == {("J8",)}
 
 
-def test_64_lost_joints_are_remembered_once_each() -> None:
+def test_up_to_64_lost_joints_are_remembered_once_each() -> None:
     motion = JointMotion()
     for place in range(140):
         t_ns = START_NS + place * 2000 * MS
@@ -191,7 +193,7 @@ def test_angles_unchanged_for_a_second_are_frozen(period_ms: float) -> None:
 
 
 @pytest.mark.parametrize("gap_ms", [200, 900, 1500, 5000])
-def test_silence_does_not_make_frozen_angles_fresh(gap_ms: int) -> None:
+def test_angles_that_are_equal_after_a_gap_stay_frozen(gap_ms: int) -> None:
     motion = JointMotion()
     assert frozen(motion, 0, 1500) is Reason.JOINTS_FROZEN
     assert frozen(motion, 1500 + gap_ms, 1800 + gap_ms) is Reason.JOINTS_FROZEN

@@ -80,7 +80,7 @@ COUNTS = {
 
 
 @pytest.mark.parametrize("count", COUNTS)
-def test_counts_beyond_what_was_seen_are_kept_from_the_network(count: int) -> None:
+def test_counts_far_outside_the_training_never_reach_the_network(count: int) -> None:
     clock, model = Clock(), FakeModel()
     given = reading(clock())
     given.counts[1, 3] = count
@@ -90,7 +90,7 @@ def test_counts_beyond_what_was_seen_are_kept_from_the_network(count: int) -> No
     assert model.runs == (0 if COUNTS[count] else 1)
 
 
-def test_a_slow_network_makes_the_verdict_stale() -> None:
+def test_a_slow_model_makes_the_verdict_stale() -> None:
     clock = Clock()
 
     class SlowModel(FakeModel):
@@ -117,7 +117,7 @@ def test_a_reading_of_other_fingers_is_unknown() -> None:
     assert pipeline(FakeModel(), clock).judge(two).reasons == (Reason.MODEL_MISMATCH,)
 
 
-def test_silence_is_stale() -> None:
+def test_a_verdict_without_a_new_reading_is_stale() -> None:
     clock = Clock()
     last_ns = clock() - 10**9
     judgement = pipeline(FakeModel(), clock).silence(last_ns)
@@ -156,7 +156,7 @@ def test_outcomes_move_the_probability_and_not_what_the_network_says() -> None:
     assert found[-1].p_slip > 0.6
 
 
-def test_a_warm_up_lifts_under_supervision() -> None:
+def test_until_the_warm_up_ends_grasps_are_unproven_and_supervised() -> None:
     clock = Clock()
     judge = trusting(FakeModel(0.3), clock, RiskLimits(0.05, warm_up=3))
     found = [lift(judge, clock, seed, slipped=False) for seed in range(4)]
@@ -171,7 +171,7 @@ def test_a_warm_up_lifts_under_supervision() -> None:
     assert not found[3].supervised
 
 
-def test_what_cannot_be_judged_is_never_supervised() -> None:
+def test_unusable_or_stale_readings_ask_for_no_supervised_lift() -> None:
     clock = Clock()
     judge = trusting(FakeModel(0.3), clock, RiskLimits(0.05, warm_up=50))
     bad = reading(clock())
@@ -183,7 +183,7 @@ def test_what_cannot_be_judged_is_never_supervised() -> None:
     assert not judgement.supervised
 
 
-def test_a_slip_stays_a_slip_under_every_risk() -> None:
+def test_a_slip_is_called_slip_even_in_the_warm_up() -> None:
     clock = Clock()
     judge = trusting(FakeModel(0.9), clock, RiskLimits(0.05, warm_up=1))
     judgement = judge.judge(reading(clock()))

@@ -53,14 +53,14 @@ def test_a_grasp_is_learnt_once_after_its_verdict(pipeline: Pipeline, learnt: Le
     assert len(learnt) == 3
 
 
-def test_a_grasp_of_exchanged_sensors_is_not_learnt(pipeline: Pipeline) -> None:
+def test_grasps_from_before_an_exchange_of_sensors_are_not_learnt(pipeline: Pipeline) -> None:
     judge(pipeline, grasps(3))
     pipeline.sensors_exchanged()
     assert pipeline.session is not None
     assert pipeline.session.grasps == 0
 
 
-def test_a_grasp_is_learnt_as_it_was_judged(
+def test_the_session_learns_each_grasp_with_its_judged_decision(
     pipeline: Pipeline, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     slips: list[bool | None] = []
@@ -73,7 +73,7 @@ def test_a_grasp_is_learnt_as_it_was_judged(
     assert set(told) == {False, True}
 
 
-def test_without_a_calibrated_session_a_careful_judge_says_unknown() -> None:
+def test_a_judge_that_needs_a_session_says_unknown_until_calibrated() -> None:
     model = TactileModel(zoo.find("small-session"))
     careful, bold = (
         Pipeline(model, model.contract.fingers, Limits(10**9), lambda: 0, needs_session=needs)
@@ -91,7 +91,7 @@ def test_without_a_calibrated_session_a_careful_judge_says_unknown() -> None:
     assert Decision.STABLE in calibrated
 
 
-def test_a_session_learns_only_what_the_strict_limit_lets_pass(
+def test_a_session_learns_only_from_steady_readings_once_per_grasp(
     monkeypatch: pytest.MonkeyPatch, learnt: Learnt
 ) -> None:
     model = TactileModel(zoo.find("small-session"))
@@ -106,7 +106,7 @@ def test_a_session_learns_only_what_the_strict_limit_lets_pass(
     np.testing.assert_array_equal(learnt, rows[2:3])
 
 
-def test_a_grasp_teaches_the_session_only_when_over(learnt: Learnt) -> None:
+def test_the_session_learns_a_grasp_only_when_it_is_over(learnt: Learnt) -> None:
     model, clock = TactileModel(zoo.find("small-session")), Clock()
     gated = Pipeline(model, model.contract.fingers, Limits(), clock, hand=HandLimits())
     judged = []

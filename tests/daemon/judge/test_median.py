@@ -68,7 +68,7 @@ def test_every_median_of_a_real_stream_follows_from_the_definition(untouched: Co
     follow(FreshMedian(SHAPE), untouched, np.ones(untouched.shape, dtype=np.bool_))
 
 
-def test_a_never_usable_electrode_reads_zero_and_holds_up_nothing() -> None:
+def test_an_electrode_never_usable_is_zero_and_not_waited_for() -> None:
     fresh, usable = FreshMedian(SHAPE), np.ones(SHAPE, dtype=np.bool_)
     usable[1, 5] = False
     for value in range(3):
@@ -77,7 +77,7 @@ def test_a_never_usable_electrode_reads_zero_and_holds_up_nothing() -> None:
     assert fresh.is_full(usable)
 
 
-def test_a_median_that_was_handed_out_stays_what_it_was() -> None:
+def test_later_sweeps_do_not_change_a_median_already_returned() -> None:
     fresh, given = FreshMedian(SHAPE), []
     for value in (1, 2, 3, 4, 5):
         fresh.push(np.full(SHAPE, value, dtype=np.uint16), None)

@@ -48,7 +48,7 @@ def test_too_many_sweeps_at_once_leave_motion_unknown() -> None:
         assert motion.known is is_known
 
 
-def test_motion_is_unknown_before_noise_and_after_a_gap() -> None:
+def test_motion_is_unknown_until_noise_is_known_and_after_gaps() -> None:
     motion, counts = Motion(1, 0.05, early=True), wavering(3.0, 100.0, 3.5, 4)
     known = []
     for index, sweep in enumerate(np.rint(counts).astype(np.uint16)):
@@ -71,7 +71,7 @@ def test_motion_is_unknown_before_noise_and_after_a_gap() -> None:
     assert not np.isfinite(moves(motion)).any()
 
 
-def test_a_held_value_is_believed_in_its_fourth_sweep() -> None:
+def test_a_jump_that_lasts_is_believed_in_its_fourth_sweep() -> None:
     motion, sweep = Motion(1, 0.05), np.full((1, 24), 2000, dtype=np.uint16)
     motion.add(0, sweep, None)
     fallen, believed = sweep.copy(), []
@@ -85,7 +85,7 @@ def test_a_held_value_is_believed_in_its_fourth_sweep() -> None:
 @pytest.mark.parametrize(
     ("electrodes", "counts", "believed"), [(4, 20, True), (4, 21, False), (5, 21, True)]
 )
-def test_four_electrodes_jumping_above_20_counts_are_spikes(
+def test_jumps_over_20_counts_in_four_electrodes_are_spikes(
     electrodes: int, counts: int, believed: bool
 ) -> None:
     motion = Motion(2, 0.05)
@@ -97,7 +97,7 @@ def test_four_electrodes_jumping_above_20_counts_are_spikes(
     assert (motion.spikes.clean == (jumped if believed else sweep)).all()
 
 
-def test_long_lost_electrodes_stay_unknown_for_a_window() -> None:
+def test_motion_is_unknown_for_a_window_after_electrodes_are_lost() -> None:
     motion = Motion(1, 0.05, early=True)
     counts = np.rint(wavering(3.0, 100.0, 3.5, 12)).astype(np.uint16)
     known = []
@@ -140,7 +140,7 @@ def test_impossible_shares_of_false_alarms_are_refused(share: float) -> None:
         Motion(3, share)
 
 
-def test_a_slow_line_has_three_sweeps_and_one_before() -> None:
+def test_at_10_hz_motion_is_known_from_the_fourth_sweep() -> None:
     motion, counts = Motion(1, 0.05), np.rint(wavering(12.0, 10.0, 3.5, 17)).astype(np.uint16)
     known = []
     for index in range(115):
@@ -152,7 +152,7 @@ def test_a_slow_line_has_three_sweeps_and_one_before() -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [1000 / 14, 100.0, 1000.0])
-def test_motion_looked_at_late_is_as_if_always_looked(rate_hz: float) -> None:
+def test_motion_computed_only_at_times_equals_motion_always_computed(rate_hz: float) -> None:
     always, late = Motion(1, 0.05), Motion(1, 0.05)
     counts = np.rint(wavering(6.0, rate_hz, 4.0, 5)).astype(np.uint16)
     for index, sweep in enumerate(counts):

@@ -126,7 +126,7 @@ def fingers_of(number: int, rate_hz: float) -> Floats:
 
 @pytest.mark.parametrize("early", [True, False])
 @pytest.mark.parametrize(("rate_hz", "seconds"), [(1000 / 14, 9.0), (100.0, 8.0), (1000.0, 2.5)])
-def test_motion_is_that_of_a_second_implementation(
+def test_motion_agrees_with_a_second_implementation(
     rate_hz: float, seconds: float, early: bool
 ) -> None:
     number = round(rate_hz * seconds)

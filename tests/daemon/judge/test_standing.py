@@ -44,7 +44,7 @@ def is_offered(said: Judgement) -> bool:
     return said.decision is Decision.STABLE or said.supervised
 
 
-def test_slip_becomes_stable_only_after_a_second_without() -> None:
+def test_slip_becomes_stable_only_after_a_second_without_slip() -> None:
     hand = tared(gate_limits())
     assert hand.play(HELD)[-1].decision is Decision.STABLE
     slips = hand.play(Feel(times=10, answer=0.6))
@@ -56,7 +56,7 @@ def test_slip_becomes_stable_only_after_a_second_without() -> None:
     assert {each.decision for each in said[first:]} == {Decision.STABLE}
 
 
-def test_values_that_keep_missing_leave_the_newest_judged() -> None:
+def test_a_verdict_is_refreshed_although_values_keep_missing() -> None:
     hand = tared(gate_limits())
     assert hand.play(HELD)[-1].decision is Decision.STABLE
     missing = (Flaw(0, 3, 2, int(ElectrodeFault.MISSING), 0),)
@@ -68,7 +68,7 @@ def test_values_that_keep_missing_leave_the_newest_judged() -> None:
     assert hand.model.runs - runs >= 80 * 10 // 110
 
 
-def test_under_a_risk_waiting_brings_no_lucky_draw() -> None:
+def test_under_a_risk_repeated_judging_brings_no_lucky_stable() -> None:
     hand = trusting(gate_limits(), RiskLimits(0.05))
     trust = hand.pipeline.trust
     assert trust is not None
@@ -85,7 +85,7 @@ def test_under_a_risk_waiting_brings_no_lucky_draw() -> None:
     assert trust.report().outstanding <= 1
 
 
-def test_an_open_hand_is_not_told_to_release_anything() -> None:
+def test_outcome_told_is_not_a_reason_once_the_hand_opens() -> None:
     hand = trusting(gate_limits(), None)
     hand.play(HELD)
     tell(hand, 1, slipped=False)
@@ -93,7 +93,7 @@ def test_an_open_hand_is_not_told_to_release_anything() -> None:
     assert (said.moment.grasp, said.reasons) == (1, (Reason.NO_CONTACT,))
 
 
-def test_a_slip_says_nothing_of_the_next_grasp() -> None:
+def test_a_slip_does_not_keep_the_next_grasp_from_stable() -> None:
     hand = trusting(gate_limits(), None)
     hand.play(Feel("faint", times=35, answer=0.9))
     tell(hand, 1, slipped=True)
@@ -114,7 +114,7 @@ outcomes = st.sampled_from([None, None, False, True])
     following=st.lists(st.tuples(outcomes, feels), min_size=3, max_size=12),
 )
 @settings(max_examples=100)
-def test_whatever_comes_a_verdict_has_all_it_needs(
+def test_after_any_readings_and_outcomes_verdicts_have_what_they_need(
     gate: HandLimits,
     limits: RiskLimits | None,
     begin: Sequence[Feel],

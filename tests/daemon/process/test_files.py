@@ -24,7 +24,7 @@ def test_a_replaced_file_has_the_given_mode(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("step", ["fsync", "chmod", "replace"])
-def test_a_step_that_fails_leaves_the_former_file_alone(
+def test_a_failed_replacement_leaves_the_former_file_unchanged(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
 ) -> None:
     path = tmp_path / "kept"
@@ -64,7 +64,7 @@ def test_other_things_than_regular_files_are_refused_at_once(tmp_path: Path) -> 
         ("pyvenv.cfg", "home = /usr/bin\nuv = 0.4.0\n", "uv pip install --python {}"),
     ],
 )
-def test_packages_are_added_by_what_made_the_environment(
+def test_the_install_command_fits_the_tool_that_made_the_environment(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file: str, content: str, command: str
 ) -> None:
     environment = tmp_path / "graspd"

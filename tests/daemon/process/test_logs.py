@@ -30,14 +30,14 @@ def test_each_line_in_the_journal_has_a_syslog_priority() -> None:
         assert line == f"<{number}>a\n<{number}>b"
 
 
-def test_only_the_named_stream_counts_as_a_journal() -> None:
+def test_stderr_is_the_journal_only_if_the_environment_names_it() -> None:
     there = os.fstat(2)
     assert is_journal({"JOURNAL_STREAM": f"{there.st_dev}:{there.st_ino}"})
     assert not is_journal({"JOURNAL_STREAM": f"{there.st_dev}:{there.st_ino + 1}"})
     assert not is_journal({})
 
 
-def test_a_complaint_in_the_journal_is_an_error(tmp_path: Path) -> None:
+def test_an_error_message_in_the_journal_has_error_priority(tmp_path: Path) -> None:
     """Standard error is a file that is named as the journal's stream."""
     log = tmp_path / "journal"
     with log.open("wb") as stream:
@@ -54,7 +54,7 @@ def test_a_complaint_in_the_journal_is_an_error(tmp_path: Path) -> None:
     assert "missing.toml" in log.read_text()
 
 
-def test_a_burst_passes_and_the_rest_is_counted() -> None:
+def test_a_burst_of_messages_passes_and_the_rest_is_counted() -> None:
     now_s = 100.0
     limit = RateLimit(lambda: now_s)
     passed = [limit.filter(record(logging.WARNING, "lost %d %%", n)) for n in range(BURST + 7)]
@@ -82,7 +82,7 @@ def test_a_lasting_fault_logs_once_a_window() -> None:
     assert passed(100) == BURST  # after a silence it is another fault
 
 
-def test_kinds_without_number_cost_no_memory_without_number() -> None:
+def test_only_200_kinds_of_messages_are_remembered_all_others_pass() -> None:
     limit = RateLimit(lambda: 0.0)
     for _ in range(BURST):
         for number in range(3 * KINDS_MAX):

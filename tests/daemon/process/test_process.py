@@ -48,7 +48,7 @@ sys.meta_path.insert(0, Finder)
 
 
 @pytest.mark.parametrize("module", ["graspd.daemon.cli", "onnxruntime"])
-def test_ctrl_c_while_loading_is_130_without_a_word(module: str) -> None:
+def test_ctrl_c_while_loading_exits_with_130_and_no_output(module: str) -> None:
     result = python(AT_IMPORT.format(module=module), "replay")
     assert (result.returncode, result.stdout, result.stderr) == (130, "", "")
 
@@ -67,7 +67,7 @@ atexit.register(lambda: print(gc.isenabled(), gc.get_freeze_count() > 10_000))
 """
 
 
-def test_garbage_collection_never_looks_through_the_modules() -> None:
+def test_loaded_modules_are_frozen_out_of_garbage_collection() -> None:
     result = python(FROZEN, "check", DEMO_SCENE)
     assert result.stdout.splitlines()[-1] == "True True"
 
@@ -133,7 +133,7 @@ def test_ctrl_c_while_leaving_ends_without_a_traceback(code: str, expected: int)
     assert (result.returncode, result.stderr) == (expected, "")
 
 
-def test_signals_one_after_the_other_leave_nothing(tmp_path: Path) -> None:
+def test_repeated_sigints_stop_a_replay_and_leave_no_files(tmp_path: Path) -> None:
     endpoint = f"ipc://{tmp_path}/graspd"
     with start("replay", "--loop", "--speed", 1, "--json", "--publish", endpoint) as process:
         wait_for(tmp_path / "graspd")
@@ -146,7 +146,7 @@ def test_signals_one_after_the_other_leave_nothing(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_limit_of_descriptors_is_raised_for_peers(tmp_path: Path) -> None:
+def test_run_raises_the_soft_descriptor_limit_to_the_hard_one(tmp_path: Path) -> None:
     scene = demo_scene(tmp_path, "loop = true")
     with start("run", scene, before=("prlimit", "--nofile=512:8192")) as process:
         wait_for(tmp_path / "v")
@@ -176,7 +176,7 @@ def redirected(redirection: str, *arguments: object, **environment: str) -> tupl
         (["--help"], ">/dev/full", "No space left on device"),
     ],
 )
-def test_an_output_that_cannot_be_written_is_one_line(
+def test_a_failed_write_to_stdout_is_one_line_on_stderr(
     arguments: list[str], redirection: str, why: str
 ) -> None:
     code, _, errors = redirected(redirection, *arguments)
@@ -184,16 +184,16 @@ def test_an_output_that_cannot_be_written_is_one_line(
     assert code == 1
 
 
-def test_a_daemon_needs_no_output(tmp_path: Path) -> None:
+def test_a_daemon_runs_with_all_standard_streams_closed(tmp_path: Path) -> None:
     scene = demo_scene(tmp_path, 'pace = "fast"')
     assert redirected("<&- >&- 2>&-", "run", scene) == (0, "", "")
 
 
-def test_closed_errors_do_not_change_the_exit_code() -> None:
+def test_a_closed_stderr_does_not_change_the_exit_code() -> None:
     assert redirected("2>&-", "run", "absent.toml") == (2, "", "")
 
 
-def test_only_an_output_without_a_reader_may_break_quietly() -> None:
+def test_a_broken_pipe_other_than_stdout_is_not_silent() -> None:
     code = """
 import graspd.daemon.commands.texts
 def run(args):
@@ -234,11 +234,11 @@ def test_an_object_may_have_any_name_on_any_terminal(tmp_path: Path) -> None:
         ("\U000e0001", r"\U000e0001"),
     ],
 )
-def test_what_could_hide_is_escaped(text: str, shown: str) -> None:
+def test_only_unprintable_characters_are_escaped(text: str, shown: str) -> None:
     assert printable(text) == shown
 
 
-def test_a_signal_is_waited_for_above_descriptor_1024() -> None:
+def test_waiting_for_a_signal_works_above_descriptor_1024() -> None:
     with crowded(), StopSignal() as stop:
         assert stop.fileno() >= SELECT_MAX
         assert not stop.wait(0.0)
