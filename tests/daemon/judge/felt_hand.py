@@ -1,6 +1,6 @@
-"""A hand that feels whatever a test draws; each verdict is held against all that it needs.
+"""A hand with readings that a test draws; each verdict is checked against what it needs.
 
-What a verdict needs is `Necessity`. Where the judge remembers more, its bounds are loose, and true.
+`Necessity` says what it needs. Where the judge remembers more, its bounds are loose but true.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from tests.daemon.judge.necessity import EARLY_MS, MOVED_COUNTS, STILL_MS, Neces
 Counts = NDArray[np.uint16]
 PERIOD_NS = 10 * MS
 NOISE = 2
-"""Counts are drawn so far around a pose, evenly: standard deviation 1.4."""
+"""Largest noise of a count, which is drawn uniformly: standard deviation 1.4."""
 QUIET_READINGS = 130
 JOINTS = ("FFJ3", "MFJ3", "THJ5")
 STILL_RAD = 0.5
 AHEAD_NS = 300 * MS
 STANDS_MS = 100
-"""A verdict that is told was judged within this time, ms."""
+"""Largest age of the network's answer in a verdict, ms."""
 STEADY_MS = 1000
-"""What was called slip is not `stable` before this time without a slip, ms."""
+"""Shortest time without a slip before a grasp that was called slip may be `stable`, ms."""
 TURN_RAD = 0.01
-"""Per reading: at 100 Hz ten times what a joint that is still may do."""
+"""Turn of a moving joint per reading, rad: at 100 Hz ten times the limit of a still joint."""
 
 
 def _poses() -> dict[str, NDArray[np.int64]]:
@@ -67,14 +67,14 @@ POSES = _poses()
 
 @dataclass(frozen=True, slots=True)
 class Flaw:
-    """What is wrong with some electrodes of a finger."""
+    """A fault of `number` electrodes of a finger, from `first` on: bits, a wrong count, or both."""
 
     finger: int
     first: int
     number: int
     bits: int
     count: int | None
-    """What they read; None: what they would without a flaw."""
+    """Their count; None: the one that they have without a flaw."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,13 +84,13 @@ class Feel:
     pose: str = "grasp"
     times: int = 1
     step_ns: int = PERIOD_NS
-    """What the daemon's clock moves on by before each."""
+    """Step of the daemon's clock before each reading, ns."""
     age_ns: int = 0
     """Age of the first reading, ns."""
     lag_ns: int = 0
     """Time by which each reading is older than the one before, ns."""
     repeats: bool = False
-    """Whether all have the counts of the first."""
+    """True if all readings have the counts of the first."""
     flaws: tuple[Flaw, ...] = ()
     joints: str = "still"
     answer: float | None = 0.1
@@ -100,7 +100,7 @@ class Feel:
 
 
 class Hand:
-    """A pipeline whose fingers are tared, and what is necessary for a verdict."""
+    """A pipeline, and the conditions that each of its verdicts must meet."""
 
     def __init__(
         self,
@@ -109,7 +109,7 @@ class Hand:
         limits: Limits = Limits(),  # noqa: B008 (frozen)
         moved_counts: float = MOVED_COUNTS,
     ) -> None:
-        """`build` makes a pipeline with these limits."""
+        """`build` makes the pipeline, with the same `gate` and `limits`; None: `fakes.pipeline`."""
         self.model, self.clock, self.limits = FakeModel(), Clock(), limits
         self.pipeline = (
             pipeline(self.model, self.clock, hand=gate)
@@ -121,10 +121,10 @@ class Hand:
             POSES["rest"], FINGERS, required, still_ms, moved_counts=moved_counts
         )
         self.answer: float | None = None
-        """What the network said when it was last asked, and of the reading of which time, ns."""
+        """Last answer of the network; `answered_ns`: time of the reading that it judged, ns."""
         self.answered_ns = 0
         self.slip = 0, 0
-        """The grasp that it last called slip, and when, ns."""
+        """Number of the grasp that the network last called slip, and time of the reading, ns."""
         self.judged = 0
         self.asked = 0
         self.random = np.random.default_rng(1)
@@ -133,7 +133,7 @@ class Hand:
         self.sent: deque[Counts] = deque(maxlen=30)
 
     def play(self, feel: Feel) -> list[Judgement]:
-        """Feel, and check each judgement."""
+        """Judge the readings of `feel`; check each judgement, and return them."""
         self.model.answer = RuntimeError("no session") if feel.answer is None else feel.answer
         first: Counts | None = None
         said = []
@@ -223,7 +223,7 @@ def limits(
     required: tuple[Finger, ...] = FINGERS,
     early: bool = False,
 ) -> HandLimits:
-    """Return limits that `Necessity` knows."""
+    """Return limits of a hand with joints, whose effects `Necessity` knows."""
     return HandLimits(
         on_request=on_request, required=required, gate=GateLimits(early=early), joints=True
     )
@@ -237,14 +237,14 @@ def _tared(gate: HandLimits) -> Hand:
 
 
 def tared(gate: HandLimits) -> Hand:
-    """A hand of its own that has rested for long enough."""
+    """Return a new copy of a hand that has rested until it was tared."""
     hand = _tared(gate)
     contract = hand.model.contract  # large, and never changed
     return copy.deepcopy(hand, {id(contract): contract})
 
 
 def often(usual: object, *others: object, times: int = 9) -> st.SearchStrategy[object]:
-    """The usual, `times` as often as all others together."""
+    """Draw the usual value `times` as often as all others together."""
     return st.sampled_from([usual] * (times * len(others)) + [*others])
 
 
@@ -261,7 +261,7 @@ few_everywhere = st.builds(
     st.integers(1, 6),
     st.integers(0, 18),
 )
-"""In some, more than can be repaired in a hand, and not in a finger."""
+"""One to six flaws in each finger: from five on too many for a hand, but not for one finger."""
 feels = st.builds(
     Feel,
     pose=often(
@@ -320,7 +320,7 @@ BEGINS = {
     "called slip": (Feel(times=35, asks=True, answer=0.9),),
     "at rest": (),
 }
-"""What a hand feels first."""
+"""Readings with which a hand begins, by name."""
 
 begins = st.sampled_from([*BEGINS.values()])
 gates = st.builds(

@@ -1,7 +1,7 @@
-"""What a verdict needs, followed reading by reading after the documentation, beside the judge.
+"""The conditions that a verdict must meet by the documentation, followed without the judge.
 
 All bounds are necessary conditions. Where the judge remembers more than is followed here (which
-electrodes jump or are dead), what depends on it is left open.
+electrodes jump or are dead), conditions that depend on it are not checked.
 """
 
 from __future__ import annotations
@@ -27,32 +27,32 @@ MOVED_COUNTS = 15.0
 """A finger whose electrodes are in the mean this far from where they were a short while ago has
 moved: the speed of nine held touches in ten stays below 20 counts/s, noise here is 1.4 counts."""
 TOUCH_COUNTS, LET_GO = 20.0, 0.6
-"""A finger touches while its third deepest electrode is this share of a touch further below its
-rest than its median electrode."""
+"""A finger touches while its third deepest electrode has fallen further than its median electrode
+by this share, the second number, of `TOUCH_COUNTS`."""
 TARE_COUNTS = 5.0
-"""What the judge's own tare may differ by, for it follows the rest and has noise."""
+"""Largest error of the judge's tare, which follows the rest and has noise, counts."""
 LET_GO_COUNTS = LET_GO * TOUCH_COUNTS - TARE_COUNTS
 JOINT_RAD_PER_S = 0.1
 JOINTS_LATE_MS, JOINTS_LOST_MS = 150, 1000
 JOINTS_FROZEN_MS = 1000
 LEFT_OUT_NS = WINDOW_MS * MS // 16
-"""Angles that come faster than this may be left out."""
+"""Time after an angle within which the judge may leave out the next one, ns."""
 REPAIRABLE_BITS = 1 | 2 | 4 | 8
 BROKEN_MAX, BROKEN_FINGER_MAX = 12, 8
 DEAD_AFTER = 16
 SWEEPS_REMEMBERED = 128
 SICK_FOR = 24
-"""Readings for which an electrode that was broken may still count as one that jumps."""
+"""Number of readings for which an electrode that was broken may still count as one that jumps."""
 DOUBT_FOR = 40
-"""Readings after one of which it is open whether the judge used it."""
+"""Number of readings that are not checked after one that the judge may or may not have used."""
 NEAREST, FURTHEST = 3, 5
-"""Three fresh values are among the last five, for at most every other one is held; and two of them
-among the last three."""
+"""Of the last five values three are fresh, because at most every other one repeats the one before;
+of the last three, two are fresh."""
 STEP_MS, STEP_SWEEPS_MAX = 5, 10
-"""Length of a step, ms, and most sweeps in it: their mean is looked at."""
+"""Length of a step, ms, and most sweeps in it. The judge uses their mean."""
 REMEMBERED = FURTHEST + 2 * STEP_SWEEPS_MAX + 2
 KEPT_MS = STILL_MS + GAP_MS + 60
-"""What is older matters to nothing here."""
+"""Age above which readings and angles are forgotten, ms."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,10 +61,10 @@ class _Used:
 
     t_ns: int
     depth: float
-    """Fall of the required finger that touches least, at best, counts."""
+    """Largest possible fall of the required finger that touches least, counts."""
     low: NDArray[np.float64]
     high: NDArray[np.float64]
-    """Shape (fingers, 24): where each electrode's median is."""
+    """Largest median of each electrode, shape (fingers, 24); `low`: the smallest."""
 
     def __deepcopy__(self, _memo: object) -> Self:
         return self
@@ -77,7 +77,7 @@ class _Angles:
 
 
 class Necessity:
-    """Knows where the fingers rest, because the test made them."""
+    """Says what a verdict on the last reading lacks. The test gives the resting counts."""
 
     def __init__(
         self,
@@ -88,7 +88,7 @@ class Necessity:
         *,
         moved_counts: float = MOVED_COUNTS,
     ) -> None:
-        """`rest`, shape (fingers, 24), is also what was read before the first reading.
+        """`rest`: resting counts, shape (fingers, 24), also those before the first reading.
 
         A gap has one limit, `GAP_MS`: no key of a scene changes that.
         """
@@ -157,7 +157,7 @@ class Necessity:
         self._use(reading, ~broken)
 
     def lacks(self) -> list[str]:
-        """What a verdict on the reading at hand would lack."""
+        """Return what a verdict on the last reading would lack; empty: nothing that is followed."""
         lacks = [*self._unusable]
         if not lacks and not self._doubt:
             lacks += self._lacks_contact() + self._lacks_stillness() + self._lacks_joints()
@@ -174,7 +174,7 @@ class Necessity:
         return bool(((same | flagged).all(axis=1) & ~flagged.all(axis=1)).any())
 
     def _comes_again(self, counts: NDArray[np.uint16], flagged: NDArray[np.bool_]) -> bool:
-        """Whether all of a finger, with nothing flagged, is as in a sweep shortly before."""
+        """Return True if a finger without flags has the same counts as in a recent sweep."""
         now = [
             None if flags.any() else sweep.tobytes()
             for sweep, flags in zip(counts, flagged, strict=True)
@@ -229,7 +229,7 @@ class Necessity:
         return []
 
     def _drop_joints(self, t_ns: int) -> None:
-        """Leave out joints that are lost, and those of a time that is over."""
+        """Forget joints that are lost, or whose angles are later than `t_ns` by far."""
         for valid, angles in list(self._joints.items()):
             age_ns = t_ns - angles[-1].t_ns
             if not -JOINTS_LATE_MS * MS <= age_ns <= JOINTS_LOST_MS * MS:

@@ -1,7 +1,7 @@
 """Tare and contact: each limit from both sides, and on a real recording of untouched sensors.
 
 The numbers are those of the rule as `graspd.daemon.judge.contact` states it: a touch takes 20
-counts, 0.6 of that or a quarter of how deep it was held keeps it, half of that after a minute.
+counts; it lasts above 0.6 of that and a quarter of its depth, after a minute half of its depth.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def test_a_touch_needs_a_fall_below_baseline_and_median_electrode(
 
 
 def held(*, for_ns: int, fall: float) -> Touch:
-    """A finger that has touched since 1 s, and its fall a while later."""
+    """Return a finger that has touched since 1 s, after a sweep `for_ns` later with this `fall`."""
     touch = Touch(THRESHOLD)
     touch.follow(S, 0.0, 100.0, 100.0)
     touch.follow(S + for_ns, 0.0, fall, fall)
@@ -104,17 +104,17 @@ Sweeps = list[Counts]
 
 
 def sweeps_of(values: Iterable[float]) -> Sweeps:
-    """Sweeps in which all 24 electrodes read the same."""
+    """Return a sweep for each value, which all 24 electrodes read."""
     return [np.full(24, round(value), dtype=np.uint16) for value in values]
 
 
 def wavering(step: float, number: int = 100) -> Sweeps:
-    """Up and down around 3000 by `step`, so that the standard deviation is 1.4826 times that."""
+    """Return sweeps that alternate around 3000 by `step`: standard deviation 1.4826 times that."""
     return sweeps_of(3000 + step * (-1) ** sweep for sweep in range(number))
 
 
 def stepping(step: float) -> Sweeps:
-    """At 3000, and half a second later `step` away from it."""
+    """Return sweeps of half a second at 3000, then of half a second at 3000 + `step`."""
     return sweeps_of([3000.0] * 50 + [3000.0 + step] * 50)
 
 
@@ -127,14 +127,14 @@ def rest_of(sweeps: Sweeps, usable: int = 24) -> Rest | None:
 
 
 def pressed(rest: Counts, by: int, electrodes: int = 6) -> Counts:
-    """The first electrodes of each finger lower by that."""
+    """Return `rest` with the first `electrodes` of each finger lower by `by`."""
     counts = rest.copy()
     counts[:, :electrodes] -= np.uint16(by)
     return counts
 
 
 def rested(fingers: int = 1) -> tuple[Contact, Counts]:
-    """Fingers that are tared by the last of a hundred sweeps, 0.99 s, and their rest."""
+    """Return fingers that are tared by the last of 100 sweeps, 0.99 s, and the resting counts."""
     contact, rest = Contact(fingers), np.repeat(REST, fingers, axis=0)
     for place in range(100):
         assert not any(contact.tared)
@@ -267,7 +267,7 @@ def test_a_baseline_rises_faster_than_it_sinks(step: float, followed: float) -> 
 
 
 NOISE = 3.5
-"""Counts, standard deviation of an untouched electrode (facts: 2.9 to 4.3)."""
+"""Standard deviation of an untouched electrode, counts (measured: 2.9 to 4.3)."""
 PRESSED = np.where(np.arange(24) % 3 == 0, 1.0, 0.2)
 """Share of a touch's depth that each electrode feels: eight all of it, the others a fifth."""
 SLOPES = np.random.default_rng(5).normal(0.0, 0.2, (3, 24))
@@ -276,7 +276,7 @@ the real recording of untouched sensors)."""
 
 
 class Hand:
-    """Feeds a hand's sweeps, 10 ms apart, to fresh values and contact."""
+    """Feeds a hand's sweeps, 10 ms apart, to `FreshMedian` and `Contact`."""
 
     def __init__(self) -> None:
         self.contact = Contact(3)
@@ -289,7 +289,7 @@ class Hand:
         self.t_ns += PERIOD_NS
 
     def play(self, sweeps: Counts) -> NDArray[np.bool_]:
-        """Which fingers touched in each sweep, shape (sweeps, fingers)."""
+        """Return which fingers touched in each sweep, shape (sweeps, fingers)."""
         touching = np.zeros((len(sweeps), 3), dtype=np.bool_)
         for place, counts in enumerate(sweeps):
             self.feel(counts)
@@ -298,14 +298,14 @@ class Hand:
 
 
 def felt(depth: float, begin_s: float, end_s: float, drift: float = 0.0) -> Counts:
-    """Sweeps of sensors that waver, drift since 0 s, counts/s, and are pressed by `depth`."""
+    """Return sweeps of noisy sensors that drift from 0 s on, counts/s, pressed by `depth`."""
     random, t_s = np.random.default_rng(1), np.arange(begin_s, end_s, 0.01)[:, None, None]
     mean = random.uniform(2400.0, 3400.0, (3, 24)) - depth * PRESSED + (drift + SLOPES) * t_s
     return np.rint(mean + random.normal(0.0, NOISE, mean.shape)).astype(np.uint16)
 
 
 def as_sampled(recorded: Counts, changed: NDArray[np.int64]) -> Counts:
-    """What a palm that held values where `recorded` repeats would have read of `changed`."""
+    """Return `changed` as a palm samples it, which repeats values where `recorded` does."""
     sampled = changed.copy()
     for sweep in range(1, len(sampled)):
         held = recorded[sweep] == recorded[sweep - 1]

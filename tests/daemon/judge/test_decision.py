@@ -57,7 +57,7 @@ def expected(
     against_stable: Reason | None,
     doubt: Decision,
 ) -> tuple[str, set[Reason]]:
-    """The rule, written down once more: everything must be well, or it is unknown."""
+    """Return decision and reasons by the rule: unless everything is well, it is `unknown`."""
     against = set(health)
     if worth.endswith("stable") and doubt is Decision.UNKNOWN and against_stable is None:
         against |= {Reason.LOW_CONFIDENCE}

@@ -1,8 +1,8 @@
 """No value of any key of a scene makes bad, old or missing data `stable`.
 
 The keys and their ranges come from the scene's own schema, so a new key is swept without a change
-here. What `stable` needs is `Necessity`. test_fewer_fingers has other hands, test_learning the
-session that a judge needs.
+here. `Necessity` says what `stable` needs. test_fewer_fingers has other hands, test_learning a
+judge that needs a session.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ NAMES: Mapping[str, tuple[Any, ...]] = {
     "model.path": (),
     "session.folder": (),
 }
-"""Values of the keys that are names, fingers of a hand and paths."""
+"""Values of keys that are names, fingers of a hand or paths; empty: the key is not varied."""
 MOVED_COUNTS = 40.0
-"""Step of counts that is motion even with few false alarms."""
+"""Mean change of a finger's counts that is motion even with few false alarms."""
 COMBINATIONS, CHUNKS = 5, 2
 TROUBLES = (
     Feel("rest", times=30),
@@ -53,13 +53,13 @@ TROUBLES = (
         for pose in ("rest", "other")
     ),
 )
-"""What must not be `stable`, or only if it is new again."""
+"""Bad, old or missing readings, which may be `stable` only once they are a new, held grasp."""
 
 Keys = dict[str, dict[str, Any]]
 
 
 def values_of(place: str, kind: Mapping[str, Any]) -> list[Any]:
-    """Values of a key: both ends of its range, and some within."""
+    """Return values of the key `place`, of schema `kind`: ends of its range, and some within."""
     if "enum" in kind:
         return list(kind["enum"])
     match kind["type"]:
@@ -89,7 +89,7 @@ KEYS = {
 
 
 def scene_of(values: Mapping[str, Any]) -> scenes.Scene:
-    """A live hand with these keys."""
+    """Return a scene of a live hand with these values, by `section.key`."""
     given: Keys = {
         "model": {"slip_threshold": 0.999},
         "tactile": {"driver": "spi", "port": "x"},
@@ -102,7 +102,7 @@ def scene_of(values: Mapping[str, Any]) -> scenes.Scene:
 
 
 def run(values: Mapping[str, Any], seed: int) -> int:
-    """Number of `stable` under these keys; -1: the scene is refused, as it should be."""
+    """Return the number of `stable` with these keys; -1: the scene is refused, as it should be."""
     try:
         plan = Plan.of(scene_of(values))
     except scenes.SceneError:

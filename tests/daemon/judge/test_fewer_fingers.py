@@ -18,7 +18,7 @@ HANDS = {"small-session-th": ("th",), "small-session-ff-th": ("ff", "th")}
 
 
 def cut(source: Path, fingers: Sequence[str], folder: Path) -> Path:
-    """A copy of a recording that has the columns of these fingers alone."""
+    """Copy a recording without the sensors of other fingers than these; return its path."""
     path = folder / source.name
     with source.open(newline="") as whole, path.open("w", newline="") as part:
         rows = csv.DictReader(whole)

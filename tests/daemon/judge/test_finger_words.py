@@ -1,4 +1,4 @@
-"""Each finger in a word: what is not known is never a touch, and the word does not flicker."""
+"""State of each finger: free, touch or slide. An unknown one is None, and none flickers."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ SLIPPING = Scenario(
     seconds=2.5,
 )
 Told = list[tuple[float, GateState | None, dict[Finger, FingerState | None]]]
-"""Time, s, state of the gate and words of each reading."""
+"""Time, s, state of the gate and states of the fingers at each reading."""
 SOUND = Checked((), None)
 
 
@@ -43,7 +43,10 @@ def felt(
     restart_s: float = math.inf,
     check: Callable[[float], Checked] = lambda _t_s: SOUND,
 ) -> Told:
-    """What is told while a hand feels this; at `restart_s` something interrupts it."""
+    """Return what a hand reports in a scenario; at `restart_s` its grasp must settle again.
+
+    `check`: result of the health check by time, s.
+    """
     hand, told = HandTracker(FINGERS, LIMITS), Told()
     for t_s, reading in readings(scenario):
         if abs(t_s - restart_s) < 1e-6:
@@ -56,7 +59,7 @@ def felt(
 
 
 def words(told: Told, finger: Finger) -> list[str]:
-    """Words of a finger, each one once, in their order."""
+    """Return the states of a finger in order, each as often as it begins."""
     said = [feelings[finger] or "unknown" for _, _, feelings in told]
     return [said[0], *(word for former, word in pairwise(said) if word != former)]
 

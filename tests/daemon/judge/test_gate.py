@@ -1,4 +1,4 @@
-"""One hand by scenarios: what it makes of whole grasps as it feels them, and what it forgets."""
+"""One hand in scenarios of whole grasps: how its gate changes, and when it forgets its tare."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ START_NS = 10**12
 SHAPE = (3, 24)
 ALL = np.ones(SHAPE, dtype=np.bool_)
 NOISE = 3.5
-"""Counts, standard deviation (facts: 2.9 to 4.3)."""
+"""Standard deviation of an electrode, counts (measured: 2.9 to 4.3)."""
 PRESSED = np.where(np.arange(24) % 3 == 0, 1.0, 0.2)
 """Share of a touch's depth that each electrode feels: 0.467 in the mean, and the third deepest
 falls by 0.8 of the depth further than the median one."""
@@ -35,33 +35,33 @@ Knots = Sequence[tuple[float, float]]
 
 @dataclass(frozen=True)
 class Scenario:
-    """A stream from a second of rest before 0 s on, and what the gate makes of it."""
+    """Readings after a second of rest that ends at 0 s, and the expected changes of the gate."""
 
     name: str
     depth: Knots | dict[str, Knots]
-    """Depth of the touch, counts by time, s, of all fingers or of each; lines in between."""
+    """Depth of the touch, counts: line through points (s, counts), of all fingers or by finger."""
     changes: str
-    """Expected: state:cause of each change."""
+    """Expected changes, each as `state:cause`."""
     seconds: float = 1.5
     settled_s: tuple[float, float] | None = None
-    """Expected: when it settles first."""
+    """Expected: earliest and latest time at which it settles first, s."""
     unusable: tuple[float, float] = (0.0, 0.0)
-    """From when to when readings come that cannot be used, s."""
+    """Begin and end of the readings that cannot be used, s."""
     missing: tuple[float, float] = (0.0, 0.0)
     joints_until_s: float = -math.inf
-    """For how long still joints send their angles, s."""
+    """Time until which joints, which keep still, send their angles, s."""
     retime: Callable[[float], float] = lambda t_s: t_s
-    """Which time a reading bears."""
+    """Function of the time at which a reading is made, s; returns the time that it states, s."""
     limits: HandLimits = LIMITS
 
 
 @dataclass
 class Played:
-    """What came of a scenario."""
+    """Hand after a scenario, and its results."""
 
     hand: HandTracker
     told: list[tuple[float, Moment, NDArray[np.uint16] | None]] = field(default_factory=list)
-    """Time, s, where in a grasp it was, and what was to be judged."""
+    """Time, s, state of the grasp, and counts to be judged, if any, of each reading."""
 
     @property
     def story(self) -> str:
@@ -70,7 +70,7 @@ class Played:
 
 
 def depths(scenario: Scenario, t_s: float) -> NDArray[np.float64]:
-    """Depth of each finger's touch at a time, shape (fingers,)."""
+    """Return the depth of each finger's touch at a time, shape (fingers,)."""
     given = scenario.depth
     felt = np.zeros(len(FINGERS))
     for place, finger in enumerate(FINGERS):
@@ -80,7 +80,7 @@ def depths(scenario: Scenario, t_s: float) -> NDArray[np.float64]:
 
 
 def readings(scenario: Scenario) -> list[tuple[float, TactileReading]]:
-    """Time, s, and reading; 110 sweeps of rest before 0 s."""
+    """Return time, s, and reading of each sweep; the first 110 are rest before 0 s."""
     random = np.random.default_rng(11)
     rest = random.uniform(2400.0, 3400.0, SHAPE)
     made = []
@@ -94,7 +94,7 @@ def readings(scenario: Scenario) -> list[tuple[float, TactileReading]]:
 
 
 def play(scenario: Scenario, interrupt_s: float = math.inf) -> Played:
-    """Feed a hand as the pipeline does; before that of `interrupt_s` readings are left out."""
+    """Feed a hand with a scenario; at `interrupt_s`, say that readings are missing before it."""
     played = Played(HandTracker(FINGERS, scenario.limits))
     hand = played.hand
     for t_s, reading in readings(scenario):
@@ -120,8 +120,8 @@ UP = "closing:contact settled:still judged:judged"
 AGAIN = "settled:still judged:judged"
 DOWN = "released:contact-lost idle:time"
 SETTLES = (0.41, 0.45)
-"""0.2 s of closing, and 240 ms in which the hand keeps still; the last sweep or two of closing are
-noise."""
+"""Expected time of settling, s: 0.2 s of closing, and 240 ms in which the hand keeps still. The
+last sweep or two of closing look still."""
 JOINTS = replace(LIMITS, joints=True)
 SUBSET = replace(LIMITS, required=("ff", "th"))
 

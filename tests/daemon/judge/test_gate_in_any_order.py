@@ -1,4 +1,4 @@
-"""The gate in any order: touch, rest, motion, stillness, gaps, joints, questions, old values."""
+"""The gate against a model, in random sequences: touch, motion, gaps, joints, questions, rest."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ MOTIONS = {
     "shakes": (False, False, True, True),
     "rushes": (False, False, False, False),
 }
-"""Whether motion keeps within the strict limit, in the short window and in both, and within the
-loose limit likewise."""
+"""Kinds of motion: whether it is within the strict limit in the short window, and in both windows;
+then the same for the loose limit."""
 OBJECTIONS = st.sampled_from(
     ((),) * 4 + ((Reason.JOINTS_LATE,), (Reason.JOINTS_LATE, Reason.NOT_TARED))
 )
@@ -101,7 +101,10 @@ class Model:
             self.go("closing", "gap")
 
     def wait(self, window: int | None) -> None:
-        """Touch and stillness last together; `window`: how far it is known to have been still."""
+        """Update how long touch and stillness have lasted, and drop an old question.
+
+        `window`: length of the window in which nothing moves, ms; None: something moves.
+        """
         if self.asked and self.asked_until is None:
             self.asked_until = self.now + 1000
         self.asked = self.asked and self.now <= (self.asked_until or 0)
@@ -140,7 +143,7 @@ class Model:
             self.go("settled", "still")
 
     def judge(self, *, fresh: bool) -> tuple[bool, bool]:
-        """Whether a sound reading is judged in time, and whether that is more than a refresh."""
+        """Return whether a sound, timely reading is judged, and if so, as more than a refresh."""
         age, wanted = self.now - self.judged, self.asked or not self.on_request
         if self.state == "judged":
             is_due = age > 100 or (fresh and (self.asked or age >= 50))
@@ -157,7 +160,7 @@ class Model:
 
 
 class Readings(RuleBasedStateMachine):
-    """What a gate is given, and the model beside it."""
+    """Gives a gate and the model the same random readings and questions, and compares them."""
 
     early: bool
     on_request: bool
@@ -197,7 +200,7 @@ class Readings(RuleBasedStateMachine):
 
     @rule(pressed=st.sampled_from((40, 41, -40)), is_broken=st.booleans(), is_held=st.booleans())
     def press(self, pressed: int, is_broken: bool, is_held: bool) -> None:
-        """Another grasp is more than 40 counts away from that of the first judgement."""
+        """Press one finger harder; over 40 counts since the first judgement are another grasp."""
         if is_held:
             self.grasp()
         self.pressed += pressed
@@ -243,7 +246,7 @@ class Readings(RuleBasedStateMachine):
             self.agree(found)
 
     def follow(self, objections: tuple[Reason, ...], change: float) -> bool:
-        """Have the model follow, and find what is against the reading; True: it is settled."""
+        """Update the model and `against`, the reasons against judging; True: it is settled."""
         model, felt, former = self.model, self.felt, self.model.touches
         within = felt.loose if model.sure else felt.strict
         model.now, model.touches = self.now, set(self.required) <= set(self.touching)
@@ -281,7 +284,7 @@ class Readings(RuleBasedStateMachine):
 
     @rule(waits=st.booleans())
     def ask(self, waits: bool) -> None:
-        """A question that waits is answered until a second after the next reading."""
+        """Ask; a question lasts a second from the next reading. `waits`: let 0.9 s of it pass."""
         self.gate.ask()
         self.model.asked, self.model.asked_until = True, None
         if waits:

@@ -19,23 +19,24 @@ from tests.daemon.fakes import FINGERS, Clock, sound
 from tests.drivers.twins.signals import crept_s, fresh_residuals, played, read_end_points
 
 GRASPS = 20
-"""Per rate."""
+"""Number of grasps at each rate."""
 STILL_COUNTS_PER_S = 20.0
 """A hand is still when its electrodes move no faster, in the mean. A held touch of a real sensor
 relaxes as fast."""
 STILL_S = 0.24
-"""What is looked back at; the end of closing is not a part of it."""
+"""Duration of stillness before a verdict, s; the end of closing is not a part of it."""
 WAITED_MAX_S = 0.5
-"""After the hand is as still as a held touch; 99 in 100 have their verdict within 0.42 s."""
+"""Longest wait for a verdict once the hand is as still as a held touch, s; 99 in 100 get it within
+0.42 s."""
 STANDS_S = 0.03
-"""A hand that opens moves nothing beyond noise for the first 20 ms; then the verdict is gone."""
+"""Longest time for which a verdict lasts while the hand opens, s: 20 ms of it look like noise."""
 
 
 @pytest.mark.parametrize("held", [True, False], ids=["71.43 Hz held", "100 Hz fresh"])
 def test_each_still_grasp_is_judged_exactly_once_before_its_lift(
     bts3_dir: Path, untouched: NDArray[np.uint16], held: bool
 ) -> None:
-    """Sweeps are those of a palm's recording, or of an SPI bridge."""
+    """`held`: values are repeated as in a palm's recording; else all are fresh, as from SPI."""
     table = [
         point
         for name in ("palm_down", "palm_side")

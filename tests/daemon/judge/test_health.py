@@ -1,4 +1,4 @@
-"""Health of readings: broken electrodes, what says nothing, and old sweeps that come again."""
+"""Health of readings: broken electrodes, unusable readings, and old sweeps that are repeated."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from tests.daemon.fakes import FINGERS, MS, Clock, sound
 from tests.drivers.one_sweep import tactile
 
 GRACE = 3
-"""Sweeps after the first turn of a ring from which no verdict may be `stable` any more."""
+"""Number of repeated sweeps after which no verdict may be `stable`."""
 UNDER_RING = 30
-"""Sweeps after that."""
+"""Number of sweeps after those; also of `stable` verdicts before packets are repeated."""
 HELD = Durations(first_rest_s=(3.0, 3.0), settle_s=(4.0, 4.0))
 
 
 def broken_of(checked: Checked) -> NDArray[np.bool_]:
-    """The broken electrodes, shape (3, 24)."""
+    """Return True for the broken electrodes, shape (3, 24)."""
     return np.zeros((3, 24), np.bool_) if checked.broken is None else checked.broken
 
 
@@ -47,9 +47,9 @@ def test_the_first_reading_is_never_counted_as_a_jump() -> None:
 
 
 def watched(steps: NDArray[np.int64]) -> list[dict[tuple[int, int], Reason]]:
-    """What was found in electrodes that go from 2000 by `steps`, shape (sweeps, 24), finger 1.
+    """Return what each reading finds if finger 1 goes from 2000 by `steps`, shape (sweeps, 24).
 
-    The electrodes of the other fingers go up and down by more than one that keeps still.
+    The electrodes of the other fingers step one count more than those that keep still may.
     """
     health, found = Health(len(FINGERS)), []
     for place in range(len(steps) + 1):
@@ -62,7 +62,10 @@ def watched(steps: NDArray[np.int64]) -> list[dict[tuple[int, int], Reason]]:
 
 
 def steps_of(sweeps: int, jumps: dict[int, int], movers: int = 1, by: int = 0) -> NDArray[np.int64]:
-    """All electrodes go up and down by one, the first by `jumps` (by sweep), others by `by`."""
+    """Return steps of one up and down for all electrodes, shape (sweeps, 24).
+
+    In the sweeps of `jumps` the first one makes that jump, and the next `movers` - 1 step by `by`.
+    """
     steps = np.tile((-1) ** np.arange(sweeps)[:, None], (1, 24))
     for sweep, jump in jumps.items():
         steps[sweep, 1:movers] = by
@@ -150,7 +153,7 @@ def test_only_counts_at_or_beyond_a_rail_are_broken(count: int, railed: bool) ->
 
 
 def flat(count: int) -> TactileReading:
-    """A reading whose electrodes all read the same."""
+    """Return a reading whose electrodes all read `count`."""
     return sound(np.full((3, 24), count))
 
 
@@ -188,7 +191,7 @@ def test_only_a_fault_of_the_whole_reading_makes_it_unusable(
 
 @pytest.mark.parametrize(("sweeps", "live"), [(2, 0), (64, 4), (128, 0), (129, 0)])
 def test_cycles_of_up_to_128_sweeps_are_frozen_when_repeated(sweeps: int, live: int) -> None:
-    """The first `live` electrodes differ by one count from turn to turn."""
+    """The first `live` electrodes of each finger differ by one count from cycle to cycle."""
     health = Health(len(FINGERS))
     old = np.random.default_rng(2).integers(500, 3500, (sweeps, 3, 24))
     for number in range(3 * sweeps):
@@ -200,7 +203,10 @@ def test_cycles_of_up_to_128_sweeps_are_frozen_when_repeated(sweeps: int, live: 
 
 @pytest.mark.parametrize("packets", [15, 896])
 def test_repeating_the_same_palm_packets_is_never_stable(packets: int) -> None:
-    """Where it restarts a packet is lost, or two contradict each other: a round lacks those."""
+    """Where they start again a packet is lost, or two contradict each other; that round lacks them.
+
+    `packets`: number of packets that are repeated.
+    """
     clock, stream = Clock(), PalmStream(FINGERS)
     model = TactileModel(zoo.find("cnn1"))
     pipeline = Pipeline(model, FINGERS, Limits(), clock, hand=HandLimits())
@@ -248,7 +254,7 @@ def test_twenty_equal_or_unread_electrodes_make_a_repeated_sweep(
 
 @pytest.mark.parametrize("faulty", ["always the same", "another each time", "at first", "later"])
 def test_repeated_sweeps_are_frozen_despite_electrodes_that_were_not_read(faulty: str) -> None:
-    """Its count means nothing, however it is flagged."""
+    """`faulty`: which electrodes are flagged, with random counts, in which sweeps."""
     health, random = Health(len(FINGERS)), np.random.default_rng(1)
     old = random.integers(500, 3500, (9, 3, 24))
     said = []

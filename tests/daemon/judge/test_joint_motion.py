@@ -1,4 +1,4 @@
-"""Whether joints keep still: speeds by hand, late and lost streams, several senders."""
+"""Whether joints keep still: speeds that are known, late and lost angles, several senders."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ START_NS = 10**12
 NAMES = ("FFJ1", "FFJ2", "FFJ3")
 ALL = (*NAMES, "THJ1")
 NOISE_RAD = 1e-9
-"""Far below all limits: what is measured is never the same to the bit."""
+"""Noise of an angle, far below all limits, so that no two angles are the same to the bit."""
 
 
 def send(motion: JointMotion, t_ns: int, *angles: float, names: tuple[str, ...] = NAMES) -> None:
@@ -30,7 +30,7 @@ def send(motion: JointMotion, t_ns: int, *angles: float, names: tuple[str, ...] 
 
 
 def turning(rate_hz: float, rad_per_s: float, seconds: float = 1.0) -> tuple[JointMotion, int]:
-    """One joint of three turns at a constant speed; also the time of the last angles."""
+    """Turn one joint of three at a constant speed; return also the time of the last angles, ns."""
     motion, t_ns = JointMotion(), START_NS
     for place in range(round(seconds * rate_hz) + 1):
         t_ns = START_NS + round(place / rate_hz * 1e9)
@@ -176,7 +176,7 @@ def test_up_to_64_lost_joints_are_remembered_once_each() -> None:
 def frozen(
     motion: JointMotion, begin_ms: int, end_ms: int, period_ms: float = 10.0
 ) -> Reason | None:
-    """Send angles that stay the same to the bit; return what is found at the last."""
+    """Send angles that stay the same to the bit; return the objection at the last."""
     found = None
     for ms in np.arange(begin_ms, end_ms + 0.5, period_ms).tolist():
         t_ns = START_NS + round(ms * MS)

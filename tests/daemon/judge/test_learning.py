@@ -1,4 +1,4 @@
-"""When a judged grasp becomes part of the session: after its verdict, and before anybody looks."""
+"""When the session takes in a judged grasp: once, after its verdict, when the grasp is over."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def pipeline() -> Pipeline:
 
 @pytest.fixture
 def learnt(monkeypatch: pytest.MonkeyPatch) -> Learnt:
-    """What the session took in, in turn."""
+    """Counts of the grasps that the session was given, oldest first; it ignores them."""
     taken: Learnt = []
     monkeypatch.setattr(SessionCalibration, "observe", lambda _, counts, slip: taken.append(counts))
     return taken

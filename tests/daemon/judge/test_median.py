@@ -15,7 +15,7 @@ Counts = NDArray[np.uint16]
 
 
 class Electrode:
-    """What counts by the definition: a value that repeats the one before does not, but the next."""
+    """Fresh values by definition: none that repeats the one before, but a third equal value."""
 
     def __init__(self) -> None:
         self.fresh: list[int] = []
@@ -33,12 +33,12 @@ class Electrode:
 
     @property
     def median(self) -> int:
-        """The first value stands for those that are missing."""
+        """Median of the last three fresh values; the first stands for those that are missing."""
         return sorted((self.fresh[:1] * 2 + self.fresh)[-3:])[1]
 
 
 def follow(fresh: FreshMedian, sweeps: Counts, usable: NDArray[np.bool_]) -> None:
-    """Push sweeps, and compare after each; shapes (sweeps, 3, 24)."""
+    """Push sweeps, and compare medians with `Electrode` after each; shapes (sweeps, 3, 24)."""
     electrodes = [Electrode() for _ in range(72)]
     for counts, mask in zip(sweeps, usable, strict=True):
         fresh.push(counts, None if mask.all() else mask)

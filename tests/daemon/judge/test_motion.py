@@ -1,4 +1,4 @@
-"""Motion in units of a finger's own noise: what slopes are, what noise makes, what is missed."""
+"""Motion in units of a finger's own noise: when it is known, spikes, lost electrodes, limits."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from graspd.daemon.judge.windows import LOST_MAX, STEPS, Noise
 
 FINGER = np.ones((1, 24), dtype=np.bool_)
 SIGMA_COUNTS, CORRELATION = 3.5, 0.32
-"""Noise of real held touches, from differences of sweeps over the root of 2, and at one sweep."""
+"""Noise of real held touches: standard deviation, from differences of sweeps over the root of 2,
+and correlation from one sweep to the next."""
 
 
 def wavering(seconds: float, rate_hz: float, sigma: float, seed: int) -> NDArray[np.float64]:
@@ -30,7 +31,7 @@ def fed(motion: Motion, counts: NDArray[np.float64], rate_hz: float, begin_ns: i
 
 
 def moves(motion: Motion) -> NDArray[np.float64]:
-    """How each finger moves in the short and in the long window, shape (2, fingers)."""
+    """Return each finger's motion in the short and in the long window, shape (2, fingers)."""
     return np.array((motion.fast, motion.slow))
 
 

@@ -1,8 +1,8 @@
-"""Motion against a second implementation: by its definitions, of all sweeps at once, in float64.
+"""`Motion` against a second implementation, which takes all sweeps at once, in float64.
 
-It shares no code and no number with the first; Gaussian tails are scipy's. What both leave out of
-noise and how windows are laid is as deploy/JUDGING.md and the docstrings of `windows` say it.
-It finds what process replay does not: a step that is the sum of its sweeps in place of their mean.
+It shares no code and no number with the first; Gaussian tails are scipy's. Noise and windows are
+as in deploy/JUDGING.md and in the docstrings of `windows`. It finds an error that a replay does
+not find: a step that is the sum of its sweeps in place of their mean.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Found:
 
 
 def steps_of(times_ns: NDArray[np.int64], counts: Floats) -> tuple[Floats, Floats]:
-    """Times, s, and means of what came within 5 ms each; the first sweep is one by itself."""
+    """Return times, s, and mean counts of steps of 5 ms or more; the first sweep is a step."""
     groups, last_ns = [[0]], times_ns[0]
     begun: list[int] = []
     for index in range(1, len(times_ns)):
@@ -48,7 +48,7 @@ def steps_of(times_ns: NDArray[np.int64], counts: Floats) -> tuple[Floats, Float
 
 
 def noise_of(steps: Floats) -> tuple[Floats, Floats]:
-    """Variance (fingers,) and correlations (2, fingers) by blocks of 24 differences each."""
+    """Return the noise's variance, shape (fingers,), and correlations after one and two steps."""
     numbers = np.arange(3, len(steps))
     numbers = numbers[: len(numbers) // 24 * 24].reshape(-1, 24)[-16:]
     squares = np.array(
@@ -67,7 +67,7 @@ def noise_of(steps: Floats) -> tuple[Floats, Floats]:
 
 
 def found_in(times_ns: NDArray[np.int64], counts: Floats, *, early: bool) -> Found:
-    """How fingers move by the last of these sweeps, shape (sweeps, fingers, 24)."""
+    """Return the fingers' motion at the last of these sweeps, shape (sweeps, fingers, 24)."""
     times, steps = steps_of(times_ns, counts)
     variance, (near, far) = noise_of(steps)
     fingers = counts.shape[1]
@@ -109,8 +109,8 @@ def found_in(times_ns: NDArray[np.int64], counts: Floats, *, early: bool) -> Fou
 
 
 def fingers_of(number: int, rate_hz: float) -> Floats:
-    """Sweeps of five fingers: hardly any noise, little, white, correlated, and a slow tremble that
-    is more than noise may be; their loudness changes, and for a while all move."""
+    """Return sweeps of five fingers: with hardly any noise, little, white and correlated noise, and
+    a tremble larger than noise may be. Their noise changes, and for a while all move."""
     random = np.random.default_rng(11)
     white = random.normal(0.0, 1.0, (number + 1, 5, 24))
     louder = 1.0 + 0.5 * np.sin(np.arange(number) / rate_hz * 0.9)[:, None]

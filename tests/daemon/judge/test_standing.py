@@ -1,4 +1,4 @@
-"""A verdict stands on all it needs, says what the network says now, and ends with its outcome."""
+"""A verdict has all it needs, follows the network's last answer, and ends with its outcome."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def test_a_slip_does_not_keep_the_next_grasp_from_stable() -> None:
 
 
 outcomes = st.sampled_from([None, None, False, True])
-"""Told of the newest grasp before a hand feels what comes next: whether it slipped."""
+"""Outcome reported of the newest grasp before the next readings: True: it slipped; None: none."""
 
 
 @given(

@@ -44,7 +44,7 @@ class Finder:
             os.kill(os.getpid(), signal.SIGINT)
 sys.meta_path.insert(0, Finder)
 """
-"""Ctrl-C in the moment in which a module is imported."""
+"""Code that interrupts its process, as Ctrl-C does, when `module` is imported."""
 
 
 @pytest.mark.parametrize("module", ["graspd.daemon.cli", "onnxruntime"])
@@ -156,7 +156,7 @@ def test_run_raises_the_soft_descriptor_limit_to_the_hard_one(tmp_path: Path) ->
 
 
 def redirected(redirection: str, *arguments: object, **environment: str) -> tuple[int, str, str]:
-    """Exit code, output and errors of a command run by a shell."""
+    """Run graspd by a shell with a redirection; return exit code, output and errors."""
     result = subprocess.run(
         ["sh", "-c", f'exec "$@" {redirection}', "sh", *GRASPD, *map(str, arguments)],
         capture_output=True,
@@ -206,7 +206,7 @@ graspd.daemon.commands.texts.run = run
 
 
 def recording_of(folder: Path, name: str) -> Path:
-    """The demo recording, its first object named like that."""
+    """Write the demo recording with the first object called `name`; return its path."""
     header, first, *rest = DEMO_TABLE.read_text().splitlines()
     recording = folder / "grasps.csv"
     text = "\n".join([header, name + first[first.index(",") :], *rest]) + "\n"
