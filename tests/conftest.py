@@ -53,25 +53,25 @@ BEGUN_FIRST = (
     "test_readme.py",
     "test_without_posix.py",
 )
-"""Files that take longest, by their place in this folder: a file is one process's own, and no
-such file may be left when the other processes are done."""
+"""Test files that take longest, which are begun first: each runs in one process, so that a long one
+begun last would run alone."""
 
 
 def data_dir() -> Path | None:
-    """Folder of the real recordings, or None where there is none."""
+    """Return the folder of the real recordings, or None if there is none."""
     given = os.environ.get("GRASPD_DATA")
     candidates = [Path(given)] if given else [ROOT / "data", ROOT.parent / "shared" / "data"]
     return next((path for path in candidates if (path / "bts3").is_dir()), None)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Option of `.ci/run`."""
+    """Add the option `--left`, which `.ci/run` uses."""
     parser.addoption("--left", metavar="FILE", help="leave out what passed by this `pytest -rap`")
 
 
 @pytest.fixture(scope="session")
 def bts3_dir() -> Path:
-    """Folder with palm_down.csv, palm_side.csv and palm_45.csv of the real data set."""
+    """Return the folder with the palm_down, palm_side and palm_45 .csv of the real data set."""
     folder = data_dir()
     if folder is None:
         pytest.skip("no real recordings: get them with `graspd data`, or set $GRASPD_DATA")
@@ -80,14 +80,14 @@ def bts3_dir() -> Path:
 
 @pytest.fixture(autouse=True, scope="module")
 def what_is_there_is_kept() -> None:
-    """Take what is alive out of the garbage collector's sight: it runs after every test, and what
-    all modules before have left would cost most of the time."""
+    """Exclude all objects that exist before a module from garbage collection, which runs after each
+    test: those of the modules before would cost most of its time."""
     gc.collect()
     gc.freeze()
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """What takes long is begun first; all else stays in its order."""
+    """Sort the files of `BEGUN_FIRST` to the front; with `--left`, leave out passed tests."""
     if said := config.getoption("left"):
         passed = set(Path(said).read_text().splitlines())
         items[:] = [item for item in items if f"PASSED {item.nodeid}" not in passed]
@@ -97,7 +97,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.fixture
 def comes_first() -> Iterator[None]:
-    """A test that is itself one end of a link in real time comes before other work."""
+    """Give a test priority over other work if it is itself one end of a link in real time."""
     with before_others():
         yield
 

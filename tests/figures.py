@@ -15,22 +15,23 @@ ROOT: Final = Path(__file__).parents[1]
 RESULTS: Final = (ROOT / "models/RESULTS.md").read_text()
 CARDS: Final = {name: zoo.card(name) for name in zoo.names()}
 WORTH: Final[Mapping[str, Any]] = CARDS["small-session"]["worth"]
-"""Figures of `graspd report worth`."""
+"""Figures of `graspd report worth` for this model."""
 PUBLISHED: Final = "published: loops, Keras predict"
-"""The published code around the weights of `cnn1`, which judge as they do in graspd."""
+"""Row of the published code, which runs the weights of `cnn1` and judges as graspd does."""
 PROTOCOLS: Final = {
     "known objects": ("cv",),
     "other objects": ("objects", "objects-whole"),
     "another day": ("session",),
 }
-"""Protocols of a column with F1, by its title: the first that the card has."""
+"""Protocols for a column with F1, by its title; the first one that the card has is used."""
 
 Rows = list[list[str]]
 """Cells of a table."""
 
 
 def table(text: str, title: str) -> tuple[list[str], Rows, tuple[int, int]]:
-    """Return titles and rows of the one table that begins with `title`, and its rows' place."""
+    """Return titles and rows of the one table in Markdown that begins with `title`, and the begin
+    and end of its rows in `text`."""
     pattern = rf"^(\| {re.escape(title)}.*\|)\n\|[-| :]*\n((?:\|.*\n)+)"
     (found,) = re.finditer(pattern, text, re.MULTILINE)
     (head,), rows = _cells([found[1]]), _cells(found[2].splitlines())
@@ -42,7 +43,10 @@ def _cells(lines: Iterable[str]) -> Rows:
 
 
 def _f1(titles: list[str], rows: Rows, *, spread: bool) -> Rows:
-    """Write the models' F1, except means over seeds, which RESULTS has."""
+    """Return `rows` with the F1 of the models' cards, except for means over seeds in RESULTS.
+
+    `spread`: with the standard deviations.
+    """
     systems = RESULTS.partition("\n## 2. ")[2].partition("\n## ")[0]
     of_seeds = {cell.partition(" (s.e.")[0] for row in _cells(systems.splitlines()) for cell in row}
     for row in rows:
@@ -110,7 +114,7 @@ def _broken(titles: list[str], rows: Rows) -> Rows:
 
 
 def _risk(_titles: list[str], rows: Rows) -> Rows:
-    """Write the least and the most of each figure, over the sessions' kinds."""
+    """Return `rows` with least and most of each figure over the kinds of sessions, by target."""
     for row in rows:
         several = [one for one in WORTH["risk"] if one["target"] == float(row[0])]
         for at, key in enumerate(("kept", "slips", "above", "supervised"), 1):
@@ -132,11 +136,11 @@ TABLES: Final[Mapping[str, Mapping[str, Callable[[list[str], Rows], Rows]]]] = {
     },
     "deploy/CHOOSING.md": {"target | good lifts": _risk},
 }
-"""By page and first title: the rows as the cards have them."""
+"""Functions from titles and rows of a table to rows by the cards; by page and first title."""
 PARAGRAPHS: Final[Mapping[str, Mapping[str, Callable[[], str]]]] = {
     "deploy/MEASURED.md": {"With a target of": _warm_up, "After outcomes": _reliability}
 }
-"""By page and first words: the paragraph as the cards have it."""
+"""Functions that return a paragraph by the cards; by page and first words."""
 
 
 def renewed(page: str) -> str:

@@ -10,11 +10,11 @@ import socket
 from graspd.biotac import FINGERS
 
 PORTS = (10_000 + (211 * os.getpid() + number) % 20_000 for number in itertools.count())
-"""Below those that the system chooses, and apart from those of the process started before."""
+"""Ports to try: below those that the system chooses, and others than processes beside it try."""
 
 
 def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
-    """A free port of the loopback, of TCP, or of UDP with `SOCK_DGRAM`."""
+    """Return a free port of the loopback, of TCP, or of UDP with `SOCK_DGRAM`."""
     while True:
         port = next(PORTS)
         with socket.socket(socket.AF_INET, kind) as probe, contextlib.suppress(OSError):
@@ -23,12 +23,12 @@ def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
 
 
 def multicast_group() -> str:
-    """A group of python-can's `udp_multicast` for this process."""
+    """Return the address of a group of python-can's `udp_multicast` for this process."""
     return f"239.74.{os.getpid() % 250}.{2 + os.getpid() // 250 % 250}"
 
 
 def can_id(group: str) -> int:
-    """Arbitration id of finger `ff` in a group: one that no other group's frames have.
+    """Return the arbitration id of finger `ff` in a group: other groups' frames have other ids.
 
     A socket of python-can hears all groups that any process of this computer has joined.
     """

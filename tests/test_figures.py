@@ -11,20 +11,20 @@ MEASURED = (ROOT / "deploy/MEASURED.md").read_text()
 
 
 @pytest.mark.parametrize("page", TABLES)
-def test_the_tables_of_a_page_are_those_of_the_cards(page: str) -> None:
+def test_a_pages_figures_are_those_of_the_models_cards(page: str) -> None:
     assert (ROOT / page).read_text() == renewed(page), "write it: python -m tests.figures"
 
 
-def test_the_learners_scale_is_the_fitted_one() -> None:
+def test_the_learners_scale_is_the_one_fitted_in_the_card() -> None:
     assert WORTH["reliability"]["shipped"] == SCALE
 
 
 def drawn(drawing: str, title: str) -> Rows:
-    """Rows of the table that a picture carries as its description: what it was drawn from."""
+    """Return rows of the table that a picture was drawn from, which is its description."""
     return table((ROOT / "deploy" / f"{drawing}.svg").read_text(), title)[1]
 
 
-def test_the_picture_of_worth_has_its_tables_figures() -> None:
+def test_the_worth_picture_has_the_figures_of_its_table() -> None:
     title = "slips among `stable` / good lifts kept"
     titles, rows, _ = table(MEASURED, title)
     every, points, _ = table((ROOT / "deploy/worth.svg").read_text(), title)

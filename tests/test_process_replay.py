@@ -1,4 +1,4 @@
-"""What graspd says of known input is what it was, within a tolerance that is stated."""
+"""The answers of graspd to known input equal the stored references, within a stated tolerance."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ ALL = [(kind, name) for kind in KINDS for name in KINDS[kind].NAMES]
 
 
 @pytest.mark.parametrize(("kind", "name"), ALL)
-def test_known_input_gets_the_answer_that_it_had(kind: str, name: str) -> None:
+def test_known_input_gets_the_answer_of_its_reference(kind: str, name: str) -> None:
     net = KINDS[kind]
     found = net.differences(net.path_of(name).read_text(), net.made(name))
     advice = "if that is meant, `python -m tests.process_replay --renew`"
@@ -32,7 +32,7 @@ def test_every_reference_judges_some_grasp() -> None:
     assert said >= {"stable", "slip", "unknown"}
 
 
-def test_a_replayed_recording_is_judged_as_before() -> None:
+def test_a_replayed_mcap_has_the_verdicts_of_the_recorded_run() -> None:
     assert verdicts.path_of("mcap").read_text() == verdicts.path_of("request_risk").read_text()
 
 
@@ -58,7 +58,7 @@ def test_a_verdict_that_changes_is_found() -> None:
     assert entries_apart(was, was[:1]) == ["2 entries became 1"]
 
 
-def test_only_so_near_to_the_threshold_the_verdict_may_turn() -> None:
+def test_verdicts_may_differ_only_close_to_the_threshold() -> None:
     was = {"n": 1, "verdict": "slip", "verdict_code": 2, "p_slip": 0.50005}
     now = was | {"verdict": "stable", "verdict_code": 1, "p_slip": 0.49998}
     assert entries_apart([was], [now]) == []
@@ -66,7 +66,7 @@ def test_only_so_near_to_the_threshold_the_verdict_may_turn() -> None:
     assert entries_apart([far], [far | {"verdict": "stable"}]) != []
 
 
-def test_only_numbers_with_a_point_may_differ_slightly() -> None:
+def test_only_decimal_numbers_may_differ_slightly() -> None:
     was = '1 verdict {"seq":3,"p_slip":0.25,"gate":null}'
     for before, after, differs in (
         ("0.25", "0.2501", False),

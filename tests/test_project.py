@@ -1,4 +1,4 @@
-"""What the project says of itself in several places agrees: version, tools of CI, links."""
+"""Facts that the project states in several places agree: version, tools of CI, links."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ PLACES = {
     ),
     (".pre-commit-config.yaml", r"repo: (\S+)"): "local",
 }
-"""By file and pattern what stands there, once."""
+"""By file and pattern: the text that the pattern's group matches, once in the file."""
 
 
 def found(name: str, pattern: str) -> list[str]:
@@ -36,7 +36,7 @@ def found(name: str, pattern: str) -> list[str]:
 
 
 def wheel_of(project: Path, folder: Path) -> dict[str, int]:
-    """Return the checksum of each file of a source tree's wheel that has no version in it."""
+    """Return the checksums of the files without a version in a wheel of `project`, by name."""
     build(project, "wheel", folder)
     (wheel,) = folder.glob("*.whl")
     with zipfile.ZipFile(wheel) as content:
@@ -63,7 +63,8 @@ def unpacked_sdist(folder: Path) -> Path:
 
 
 def without_links(folder: Path) -> Path:
-    """Copy the source tree as git checks it out on Windows: a link is a file with its target."""
+    """Copy the source tree as git checks it out on Windows, where a link is a file with its target;
+    return `folder`."""
     for name in ("daemon", "drivers", "models", "deploy"):
         shutil.copytree(ROOT / name, folder / name, symlinks=True)
     for name in ("pyproject.toml", "README.md", "LICENSE"):
@@ -78,7 +79,7 @@ def without_links(folder: Path) -> Path:
 
 
 @pytest.mark.parametrize("source", [unpacked_sdist, without_links])
-def test_a_wheel_is_the_same_from_any_archive(
+def test_a_wheel_is_the_same_from_any_copy_of_source(
     source: Callable[[Path], Path], tmp_path: Path
 ) -> None:
     files = wheel_of(ROOT, tmp_path / "wheel")
@@ -118,7 +119,9 @@ def shell(folder: Path, script: str) -> str:
         ("rm -rf .git", r"0\.0"),
     ],
 )
-def test_a_version_follows_tag_and_commit(after: str, expected: str, tmp_path: Path) -> None:
+def test_the_version_follows_from_tag_and_commits(
+    after: str, expected: str, tmp_path: Path
+) -> None:
     for name in ("pyproject.toml", "README.md", "LICENSE", ".gitattributes", ".git_archival.txt"):
         shutil.copy(ROOT / name, tmp_path)
     script = f"""
@@ -137,7 +140,7 @@ def test_the_version_is_the_same_everywhere() -> None:
     }
 
 
-def test_the_changelog_begins_with_this_or_no_version() -> None:
+def test_the_changelogs_newest_release_is_this_version_or_missing() -> None:
     headings = found("deploy/CHANGELOG.md", r"^## \[(.*?)\]")
     released = [heading for heading in headings if heading != "Unreleased"]
     assert headings[0] == "Unreleased"
@@ -147,7 +150,7 @@ def test_the_changelog_begins_with_this_or_no_version() -> None:
         assert f"becomes {VERSION}." in (ROOT / "deploy/CHANGELOG.md").read_text()
 
 
-def test_the_hooks_run_what_ci_runs() -> None:
+def test_the_commit_hooks_run_the_lint_steps_of_ci() -> None:
     hooks = found(".pre-commit-config.yaml", r"entry: \.venv/bin/(.*)$")
     (checks,) = re.findall(
         r"step \"lint\"\n(.*?)step \"what", (ROOT / ".ci/run").read_text(), re.DOTALL
@@ -165,12 +168,12 @@ PAGES += ROOT.glob("deploy/**/*.md")
 
 
 def heading_anchors(page: Path) -> set[str]:
-    """How a link names the headings of a page."""
+    """Return the anchors of a page's headings, by which links name them."""
     headings = re.findall(r"^#+ (.*)$", page.read_text(), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", each.lower()).replace(" ", "-") for each in headings}
 
 
-def test_links_of_pages_lead_somewhere() -> None:
+def test_local_links_of_pages_lead_to_existing_files_and_headings() -> None:
     lost = []
     for page in PAGES:
         for link in re.findall(r"\]\((?!https?://)([^)\s]+)\)", page.read_text()):
@@ -181,12 +184,12 @@ def test_links_of_pages_lead_somewhere() -> None:
     assert lost == []
 
 
-def test_files_that_contributors_are_sent_to_are_there() -> None:
+def test_files_named_for_contributors_exist() -> None:
     for page in (".github/CONTRIBUTING.md", "deploy/ARCHITECTURE.md"):
         named = found(page, r"[` ]((?:daemon|drivers|models|tests|deploy)/[^`\s]*)`")
         assert len(named) > 10
         assert [name for name in named if not (ROOT / name).exists()] == []
 
 
-def test_the_page_of_attacks_has_a_row_for_each() -> None:
+def test_the_page_of_attacks_has_a_row_for_each_attack() -> None:
     assert found("deploy/ATTACKS.md", r"^\| `([a-z0-9-]+)` \|") == list(ATTACKS)

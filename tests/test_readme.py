@@ -1,4 +1,4 @@
-"""The code of the README and of the clients' page is run as it stands there."""
+"""The programs in the README and the clients' page work as they stand there."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ README = (ROOT / "README.md").read_text()
 ENDPOINT = "ipc:///tmp/graspd-demo.ipc"
 CLIENTS = (ROOT / "deploy/clients/README.md").read_text()
 BESIDE = {"OUT": "ipc:///run/graspd/right.ipc", "ASK": "ipc:///run/graspd/right.ask.ipc"}
-"""Endpoints in the programs of the clients' page: those of a scene that names none."""
+"""Endpoints in the programs of the clients' page, which are a scene's defaults."""
 
 
 def block(language: str, page: str = README) -> str:
-    """The first code block of a page in this language."""
+    """Return the first code block in this language in the text of a page."""
     return str(re.findall(rf"```{language}\n(.*?)```", page, re.DOTALL)[0])
 
 
 def program(endpoint: str) -> str:
-    """The README's, for an endpoint, and with less patience until the first message."""
+    """Return the README's program with this endpoint, and with a tenth of its timeout."""
     code = block("python")
     assert ENDPOINT in code
     assert code.count("2000") == 1

@@ -1,4 +1,4 @@
-"""What is not the daemon runs where Python lacks POSIX, by `tests/without_posix.py`."""
+"""Everything but the daemon runs where Python lacks POSIX, as by `tests/without_posix.py`."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ for line in lines:
 print(json.dumps(said))
 """
 TIMES = re.compile(r"in [0-9.]+ s| +[0-9]+ us")
-"""What differs from run to run."""
+"""Times in an output, which differ from run to run."""
 NEED_LINUX = {
     "commands.run",
     *(f"publish.{name}" for name in ("listener", "porter", "questions", "sockets")),
@@ -55,7 +55,7 @@ DRIVERS_THAT_NEED_IT = {"spi.driver", "twins.spi"}
 
 @pytest.fixture(scope="module")
 def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with the first second of a stream, and the first forty grasps."""
+    """Return a folder with the first rows of the demo stream, 3 s, and the first forty grasps."""
     folder = tmp_path_factory.mktemp("short")
     for path, rows in ((GRASPS, 41), (STREAM, 301)):
         lines = path.read_text().splitlines(keepends=True)[:rows]
@@ -82,7 +82,7 @@ def said_of(*lines: str) -> list[tuple[int, str, str]]:
     return found
 
 
-def test_only_what_needs_linux_is_not_imported() -> None:
+def test_without_posix_only_modules_that_need_linux_fail_to_import() -> None:
     code, refused, problem = without("--refused")
     assert code == 0, problem
     expected = {f"graspd.daemon.{name}" for name in NEED_LINUX}
@@ -90,7 +90,9 @@ def test_only_what_needs_linux_is_not_imported() -> None:
     assert set(refused.split()) == expected
 
 
-def test_commands_print_the_same(short: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands_print_the_same_without_posix(
+    short: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(short)
     lines = (
         f"replay {GRASPS.name} --verbose",
@@ -105,14 +107,14 @@ def test_commands_print_the_same(short: Path, monkeypatch: pytest.MonkeyPatch) -
         assert out == TIMES.sub("", graspd(*line.split()).stdout)
 
 
-def test_library_judges_the_same(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_library_judges_the_same_without_posix(capsys: pytest.CaptureFixture[str]) -> None:
     code, out, problem = without("-c", JUDGE)
     assert code == 0, problem
     exec(JUDGE, {})
     assert out == capsys.readouterr().out
 
 
-def test_what_needs_linux_says_so() -> None:
+def test_commands_that_need_linux_say_so_in_one_line() -> None:
     for code, out, problem in said_of(
         "run demo.toml",
         "doctor demo.toml",
@@ -126,7 +128,7 @@ def test_what_needs_linux_says_so() -> None:
         assert problem.count("\n") == 1
 
 
-def test_page_is_served_until_interrupted() -> None:
+def test_the_web_page_is_served_without_posix_until_interrupted() -> None:
     port = free_port()
     words = ("watch", "--web", SCENES / "demo.toml", "--port", port)
     with start(*words, program=WITHOUT) as watch:
@@ -137,7 +139,7 @@ def test_page_is_served_until_interrupted() -> None:
 
 
 @pytest.mark.slow
-def test_model_is_trained_and_tried(tmp_path: Path) -> None:
+def test_a_model_is_trained_and_tried_without_posix(tmp_path: Path) -> None:
     pytest.importorskip("torch", reason="needs the extra `train`")
     words = ("--own", GRASPS, "--folds", 2, "--only", "cv", "--quiet", "--out", tmp_path)
     code, _, problem = without("train", "small-session", *words)

@@ -1,4 +1,4 @@
-"""The checker of words finds what it refuses, where it stands, and nothing else."""
+"""The checker of words finds each refused phrase, with its line, and nothing else."""
 
 from __future__ import annotations
 
@@ -52,14 +52,14 @@ def test_refused_phrases_are_found_with_their_lines(
     assert [(each.line, each.phrase) for each in check_file(path)] == expected
 
 
-def test_names_of_tests_are_read() -> None:
+def test_names_of_tests_are_checked_but_not_their_strings() -> None:
     source = 'def test_it_goes_on():\n    """Wait for nobody."""\n    print("so long as")\n'
     texts = [(each.line, each.text) for each in texts_of_test(source)]
     assert (1, "test it goes on") in texts
     assert "so long as" not in [text for _, text in texts]
 
 
-def test_a_subject_may_have_72_characters() -> None:
+def test_a_commit_subject_may_have_72_characters_at_most() -> None:
     log = f"1a2b3c4 {'x' * 72}\n2b3c4d5 {'y' * 73}\n"
     (complaint,) = check_subjects(log)
     assert complaint.startswith("commit 2b3c4d5: subject of 73 characters")

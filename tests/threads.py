@@ -9,7 +9,10 @@ from contextlib import contextmanager
 
 @contextmanager
 def at_work(*tasks: Callable[[threading.Event], object]) -> Iterator[threading.Event]:
-    """Each in a thread until the block is left; the event that each is given is set then."""
+    """Run each task in a thread, with an event that is set at the end of the block, and wait then.
+
+    Yields the event.
+    """
     stop = threading.Event()
     threads = [threading.Thread(target=task, args=(stop,)) for task in tasks]
     for thread in threads:

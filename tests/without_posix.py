@@ -44,7 +44,7 @@ FAMILIES: Final = ("AF_UNIX", "AF_CAN", "PF_CAN", "SOCK_CLOEXEC", "SOCK_NONBLOCK
 
 
 def main(arguments: list[str]) -> int:
-    """Take POSIX away, then do what the arguments say; return the exit code."""
+    """Take POSIX away, then run what the arguments name; return the exit code."""
     for name in LIBRARIES + (TRAINING if "train" in arguments else ()):
         with contextlib.suppress(ModuleNotFoundError):
             importlib.import_module(name)
@@ -60,7 +60,7 @@ def main(arguments: list[str]) -> int:
 
 
 def take_away() -> None:
-    """Take away what Windows lacks; let a folder not be opened, and wait for sockets alone."""
+    """Take away what Windows lacks; refuse to open folders, and to wait for others than sockets."""
     for module in MODULES:
         sys.modules[module] = None  # type: ignore[assignment]
     _remove(os, *CALLS.split())

@@ -21,9 +21,9 @@ ROOT = Path(__file__).parents[1]
 FOLDERS = ("daemon", "drivers", "models", "deploy", "tests")
 """Folders of source."""
 SUFFIXES = {".py", ".c", ".h", ".cpp", ".hpp", ".sh"}
-"""Ends of the names of source files."""
+"""Suffixes of source files."""
 OTHERS = ("README.md", "deploy/**/*.md", "models/*.md", ".ci/run", ".ci/quick")
-"""Pages, and scripts without such an end."""
+"""Patterns of pages, and scripts without a suffix."""
 EXEMPT = {ROOT / "tests/words.py", ROOT / "tests/test_words.py"}
 """Files that have the refused phrases on purpose."""
 SUBJECT_MAX = 72
@@ -107,7 +107,7 @@ def docstrings(tree: ast.Module) -> Iterator[ast.Constant]:
 
 
 def messages(tree: ast.Module, docs: Iterable[ast.Constant]) -> Iterator[Text]:
-    """Yield the strings of several words that are no docstrings, f-strings as a whole."""
+    """Yield the strings of several words other than `docs`; f-strings as a whole."""
     done = {id(constant) for constant in docs}
     for node in ast.walk(tree):
         if isinstance(node, ast.JoinedStr):
@@ -160,7 +160,7 @@ def complaints(place: str, texts: Iterable[Text]) -> Iterator[Complaint]:
 
 
 def _blanked(code: re.Match[str]) -> str:
-    """Return spaces in place of code, which may have any name."""
+    """Return spaces in place of the match, which is code and may have any name."""
     return re.sub(r"[^\n]", " ", code[0])
 
 

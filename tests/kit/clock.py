@@ -1,10 +1,10 @@
-"""A clock of the test."""
+"""A clock that a test moves by hand."""
 
 from __future__ import annotations
 
 
 class Clock:
-    """A clock that moves only when told to."""
+    """Clock, ns, that stands still until a test sets `now_ns`; call it for the time."""
 
     def __init__(self, now_ns: int = 10**12) -> None:
         self.now_ns = now_ns

@@ -16,7 +16,10 @@ SELECT_MAX = 1024
 
 @contextlib.contextmanager
 def crowded() -> Iterator[None]:
-    """Hold `DESCRIPTORS` descriptors, so that a new one is above `SELECT_MAX`."""
+    """Hold `DESCRIPTORS` descriptors, so that a new one is above `SELECT_MAX`.
+
+    Skips the test if the system allows fewer than twice `DESCRIPTORS`.
+    """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if 0 <= hard < 2 * DESCRIPTORS:
         pytest.skip(f"at most {hard} descriptors are allowed here")

@@ -29,9 +29,10 @@ SEED = 0
 DRIFT_ENDS = 0.6
 """Share of the day after which the sensors stop drifting."""
 DRIFT_TO_STABLE = 1.2
-"""Drift of the day toward stable grasps, in differences between the classes."""
+"""Drift over the day, in multiples of the mean difference from slips to stable grasps."""
 DRIFT_COUNTS, DRIFT_GAIN = 60.0, 0.1
-"""Standard deviations over the electrodes: of an offset, counts, and of a gain's logarithm."""
+"""Random drift: standard deviations over the electrodes of the offset, counts, and of the logarithm
+of the gain."""
 STREAM_GRASPS = 12
 STREAM_DURATIONS = Durations(
     first_rest_s=(1.2, 1.2),
@@ -68,7 +69,10 @@ def draw_day(model: GraspMixtures, rng: np.random.Generator, grasps: int) -> Syn
 
 
 def write_stream(rows: Iterable[GraspRow], file: TextIO, t_decimals: int) -> None:
-    """Write a stream of ff, mf, th; the label is 0 before the first grasp."""
+    """Write a stream of ff, mf, th with times of `t_decimals` decimals, s.
+
+    The label is 0 before the first grasp.
+    """
     electrodes = [name for finger in TABLE_FINGERS for name in electrode_columns(finger)]
     file.write(",".join([TIME, OBJECT, SLIPPED, *electrodes, *JOINT_NAMES]) + "\n")
     for row in rows:
@@ -79,7 +83,7 @@ def write_stream(rows: Iterable[GraspRow], file: TextIO, t_decimals: int) -> Non
 
 
 def main(folder: Path = DEMO_TABLE.parent) -> None:
-    """Write the demo table, the demo day, the short stream and the one to watch."""
+    """Write the demo table, the demo day, the short stream and the one to watch into `folder`."""
     model = synthetic.read_model()
     table = synthetic.draw(model, np.random.default_rng(SEED), TABLE_GRASPS)
     day = draw_day(model, np.random.default_rng(SEED), DAY_GRASPS)

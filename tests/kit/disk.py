@@ -1,4 +1,4 @@
-"""A disk that hangs while a test says so."""
+"""A disk that hangs until a test lets it continue."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 
 class Disk:
-    """Holds every file that is written to the disk by a call, until `goes_on` is set."""
+    """Makes each `call` that syncs a file wait while the event `goes_on` is cleared."""
 
     def __init__(
         self, monkeypatch: pytest.MonkeyPatch, call: Literal["fsync", "fdatasync"]

@@ -1,4 +1,4 @@
-"""Running a command of graspd inside this process: as sure as in one of its own, and far faster."""
+"""Run a command of graspd inside the process of the test, which is faster than a new one."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def graspd(*arguments: object) -> CompletedProcess[str]:
 
 @contextlib.contextmanager
 def _as_it_was() -> Iterator[None]:
-    """Let the command set up its log and its limits as in a new process; undo that after it."""
+    """Let the block set up its log and limits as in a new process; restore both after it."""
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     root = logging.getLogger()
     handlers, level = root.handlers, logging.getLogger(LOGGER).level

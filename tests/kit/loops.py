@@ -1,4 +1,4 @@
-"""A loop on a clock of the test, with everything around it replaced."""
+"""The daemon's loop on a clock of the test, with a fake driver, model, outputs and waits."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.kit.messages import decode_status
 
 
 class SentMessages:
-    """Keeps what was sent to it."""
+    """Output of an `Outbox` that keeps the messages."""
 
     def __init__(self) -> None:
         self.sent: list[tuple[bytes, bytes]] = []
@@ -41,7 +41,7 @@ class SentMessages:
 
 
 class ClockSelector(selectors.SelectSelector):
-    """Moves the clock instead of waiting; no descriptor is ever ready."""
+    """Selector that moves the clock by the timeout instead of waiting; nothing is ever ready."""
 
     def __init__(self, clock: Clock) -> None:
         super().__init__()
@@ -53,7 +53,7 @@ class ClockSelector(selectors.SelectSelector):
 
 
 class LoopBench(Companion):
-    """A loop, and what came out of it."""
+    """A loop, and the messages, verdicts and times that it has produced."""
 
     def __init__(
         self,
@@ -74,7 +74,7 @@ class LoopBench(Companion):
     ) -> None:
         """Without `stop` the bench has one of its own, which `run` closes.
 
-        With `cost_ns` time stands still except for waits and for what each verdict costs.
+        With `cost_ns` time stands still except in waits and by its result, ns, for each verdict.
         """
         self.driver = driver
         self.clock = clock

@@ -1,4 +1,4 @@
-"""Reading the daemon's messages, and those that were agreed on."""
+"""Decoders of the daemon's messages, and the golden ones, which clients must understand."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ decode_status = msgspec.json.Decoder(Status).decode
 
 
 def golden(name: str) -> Message:
-    """Return a golden message; its name begins with its kind."""
+    """Return a golden message by the name of its file, which begins with its kind."""
     kind = name.partition("_")[0]
     return msgspec.json.decode((GOLDEN / f"{name}.json").read_bytes(), type=MESSAGES[kind])
 

@@ -29,7 +29,7 @@ def demo_scene(folder: Path, tactile: str = "", *, sections: str = "") -> Path:
 
 
 def session_scene(folder: Path, model: str = "small-session", sections: str = "") -> Path:
-    """Write a scene of live sensors that keeps sessions in `right` beside it; return its path.
+    """Write a scene of an SPI bridge that keeps sessions in `right` beside it; return its path.
 
     `sections` has further lines of `[session]`, or further sections.
     """

@@ -17,9 +17,9 @@ def write_table(
     objects: Sequence[str] | None = None,
     fingers: Sequence[str] = ("ff", "mf", "th"),
 ) -> None:
-    """Write a grasp table in the published form; without `objects`, of balls.
+    """Write a grasp table in the published form; without `objects`, each is called `ball`.
 
-    `counts`: shape (N, fingers, 24), of these `fingers`.
+    `counts`: shape (N, fingers, 24), of these `fingers`. `slipped`: shape (N,).
     """
     header = ["object", "slipped"]
     header += [f"{finger}_biotac_{n}" for finger in fingers for n in range(1, 25)]

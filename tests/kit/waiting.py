@@ -12,7 +12,7 @@ PATIENCE_S = 100.0
 def wait_until(
     condition: Callable[[], object], step_s: float = 0.002, says: str = "it did not happen"
 ) -> None:
-    """Call `condition` until it is true; fail after `PATIENCE_S`, and say why."""
+    """Call `condition` every `step_s` until it is true; fail with `says` after `PATIENCE_S`."""
     deadline_s = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < deadline_s, says

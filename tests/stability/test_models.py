@@ -42,7 +42,7 @@ DEFAULT = "small-session"
 
 @pytest.fixture(scope="module", autouse=True)
 def trust_once() -> Iterator[None]:
-    """What belongs to no model is measured once for all tests of a process."""
+    """Measure the rows of learner and risk, which belong to no model, once per process."""
     measure = trust.rows
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(trust, "rows", cache(lambda outcomes: list(measure(outcomes))))
@@ -50,14 +50,14 @@ def trust_once() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("name", zoo.names())
-def test_each_model_keeps_its_bounds(name: str) -> None:
+def test_each_model_keeps_the_bounds_of_the_stability_report(name: str) -> None:
     rows = list(chain.rows(name))
     assert {row.case for row in rows} >= {*READINGS, "next to the threshold"}
     assert [row.case for row in rows if row.broken] == []
     assert all(sum(row.answers.values()) == row.figures["readings"] > 0 for row in rows)
 
 
-def test_real_grasps_keep_the_bounds(bts3_dir: Path) -> None:
+def test_the_default_model_keeps_the_bounds_on_real_grasps(bts3_dir: Path) -> None:
     rows = list(chain.rows(DEFAULT, bts3_dir))[-3:]
     assert [row.figures["readings"] for row in rows] == [1276, 1273, 2133]  # as published
     assert [row.case for row in rows if row.broken] == []
@@ -72,7 +72,7 @@ def test_a_wrong_reference_breaks_the_bounds(monkeypatch: pytest.MonkeyPatch) ->
     assert {"network", "p_slip", "flips"} <= set(compared("mlp").broken)
 
 
-def test_a_wrong_input_breaks_the_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_wrong_network_input_breaks_its_bound(monkeypatch: pytest.MonkeyPatch) -> None:
     model = TactileModel(zoo.find("mlp"))
     build = model.inputs.build
 
@@ -86,7 +86,7 @@ def test_a_wrong_input_breaks_the_bound(monkeypatch: pytest.MonkeyPatch) -> None
     assert "input" in Comparison(model, None).row("made up", random).broken
 
 
-def test_a_figure_that_is_not_a_number_is_broken() -> None:
+def test_a_figure_that_is_nan_breaks_its_bound() -> None:
     row = Row(
         "mlp", "made up", {"p_slip": float("nan"), "flips": 0.0}, {"p_slip": 1.0, "flips": 0.0}
     )
@@ -96,7 +96,7 @@ def test_a_figure_that_is_not_a_number_is_broken() -> None:
 
 
 def compared(name: str) -> Row:
-    """Compare a model on random counts."""
+    """Return the row of a model for random counts."""
     (row,) = (row for row in chain.rows(name) if row.case == RANDOM)
     return row
 
@@ -117,7 +117,7 @@ def test_the_report_names_computer_and_broken_rows(monkeypatch: pytest.MonkeyPat
     assert json.loads(broken.stdout)["broken"] == 27
 
 
-def test_a_missing_model_or_table_is_one_line(tmp_path: Path) -> None:
+def test_a_missing_model_or_table_is_one_line_on_stderr(tmp_path: Path) -> None:
     for words, named in ((["no-such-model"], "no-such-model"), (["--data", tmp_path], "palm_down")):
         refused = graspd("report", "stability", *words)
         assert (refused.returncode, refused.stdout) == (2, "")
@@ -159,7 +159,7 @@ def loaded(name: str) -> tuple[TactileModel, Reference]:
 @pytest.mark.parametrize("name", HANDS)
 @settings(max_examples=200)
 @given(counts=HAND)
-def test_inputs_and_probabilities_keep_their_bounds_over_12_bits(name: str, counts: Raw) -> None:
+def test_for_any_12_bit_counts_inputs_and_probabilities_keep_bounds(name: str, counts: Raw) -> None:
     model, reference = loaded(name)
     counts = counts[: len(model.contract.fingers)]
     inputs = builder(model.contract.input, len(counts))

@@ -1,4 +1,4 @@
-"""A network made up for the worst: variances that no training gives."""
+"""Networks with extreme variances in batch norm, which no training gives."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from graspd.models.training.estimators.networks import IMAGE_SHAPE, build, for_i
 from graspd.models.training.reports.stability.chain import P_SLIP_ERROR_MAX
 
 VARIANCES = torch.tensor((0.0, 1e-38, 1e-12, 1.0, 1e12, 1e38))
-"""Running statistics of batch norm, in turn; the last is near float32's largest number."""
+"""Running variances of batch norm, repeated over the channels; the last is near float32's limit."""
 
 
-def test_batch_norm_is_folded_whatever_its_variances() -> None:
+def test_folding_batch_norm_of_any_variance_keeps_the_probabilities() -> None:
     with torch.random.fork_rng(), torch.no_grad():
         torch.manual_seed(0)
         network = build(NetworkConfig(filters=12, hidden=24, dropout=0.4)).eval()
