@@ -26,9 +26,9 @@ enum counts_result { COUNTS_OK, COUNTS_END, COUNTS_BAD };
 /* The pattern (`path` NULL), standard input ("-"), or a file. False if it cannot be opened. */
 bool counts_open(struct counts *counts, const char *path, unsigned sensors);
 
-/* Make row `row` the current row. Rows are taken in order; row 0 begins a file again. A row is a
- * line of sensors * 24 numbers 0..4095, sensor by sensor, apart by spaces or commas; lines that
- * begin with # are skipped. */
+/* Make `row` the current row: the pattern's, else the next line; row 0 begins a file again. A line
+ * has sensors * 24 numbers 0..4095, sensor by sensor, apart by spaces or commas; lines that begin
+ * with # are skipped. */
 enum counts_result counts_take(struct counts *counts, uint32_t row);
 
 void counts_close(struct counts *counts);

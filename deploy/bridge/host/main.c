@@ -56,7 +56,7 @@ static void remove_link(void)
     }
 }
 
-/* A signal may come while the program waits for its counts, so it ends right here. */
+/* Handle a signal: end the program here, as it may be waiting for its counts. */
 static void stop(int signal_number)
 {
     (void)signal_number;
@@ -78,7 +78,8 @@ static void fail(int code, const char *format, ...)
 
 /* ---- options --------------------------------------------------------------------------------- */
 
-/* A number at *text, which moves on behind it and one separator. */
+/* Parse the number at *text, and move *text behind it and one separator (: or ,). A wrong one ends
+ * the program. */
 static unsigned long number(const char *option, const char **text, int base, unsigned long least,
                             unsigned long most)
 {
@@ -227,7 +228,7 @@ static void apply_outages(const struct options *options, uint32_t sweeps)
     }
 }
 
-/* Return false when the stream of counts has ended. */
+/* Give the sensors the counts of a row. Return false when the counts have ended. */
 static bool apply_counts(struct counts *counts, uint32_t row)
 {
     unsigned i;

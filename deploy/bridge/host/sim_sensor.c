@@ -24,7 +24,7 @@ static bool odd(unsigned value)
     return ones % 2 == 1;
 }
 
-/* `D11..D5 P  D4..D0 0 0 P` (manual figure 15). */
+/* The response word of a count: `D11..D5 P  D4..D0 0 0 P` (manual figure 15). */
 static uint16_t response_word(uint16_t count)
 {
     unsigned high = (unsigned)(count / 32u) * 2u, low = (unsigned)(count % 32u) * 8u;
@@ -69,8 +69,8 @@ static uint16_t sampled_word(const struct sim_sensor *sensor, uint8_t command)
     }
 }
 
-/* Properties (manual table 10). The first read after power-up stays empty: the C library of
- * SynTouch reads one in vain before it trusts the answer. */
+/* Prepare the answer to a property command (manual table 10). The first after power-up is empty:
+ * the C library of SynTouch reads one in vain before it trusts the answer. */
 static void take_property(struct sim_sensor *sensor)
 {
     const char *text = "";

@@ -14,8 +14,8 @@ _Static_assert(BRIDGE_SPI_HZ >= 500000 && BRIDGE_SPI_HZ <= 10000000, "manual sec
 
 enum { ALL_SENSORS = (1 << BRIDGE_SENSORS) - 1, SLOW_US = 500000, FAST_US = 100000 };
 
-/* Blinks fast while a sensor is missing; otherwise on while sweeping, and blinks slowly while not.
- * Returns the time of the next change. */
+/* Sets the light: blinks fast while a sensor is missing; otherwise on while sweeping, and blinks
+ * slowly while not. Returns the time of the next change. */
 static uint64_t show(const struct bridge *bridge)
 {
     const bool missing = bridge->present != ALL_SENSORS;

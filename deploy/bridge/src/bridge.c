@@ -27,7 +27,7 @@ static bool fits(const struct bridge *bridge, size_t size)
     return size <= sizeof bridge->tx - bridge->tx_used;
 }
 
-/* A frame goes out whole or not at all. */
+/* Queue a frame for the host; one that has no room is dropped whole, and counted. */
 static void queue(struct bridge *bridge, const uint8_t *data, size_t size)
 {
     size_t i;
@@ -57,8 +57,8 @@ static void flush(struct bridge *bridge)
     }
 }
 
-/* A HELLO waits for room instead of being dropped: a host that comes back to a full queue needs it.
- */
+/* Queue the HELLO that was asked for; without room try again later, since a host that comes back to
+ * a full queue needs it. */
 static void send_hello(struct bridge *bridge)
 {
     struct protocol_hello hello;
@@ -147,8 +147,8 @@ static bool is_serial_number(const uint8_t text[PROTOCOL_TEXT])
     return text[0] == 'B' && text[1] == 'T';
 }
 
-/* A sensor is present if its serial number starts with "BT". The firmware version is read twice
- * first: the C library of SynTouch does, to wake the sensor. */
+/* Note whether a sensor is present: its serial number starts with "BT". The firmware version is
+ * read twice first: the C library of SynTouch does, to wake the sensor. */
 static void look_for(struct bridge *bridge, uint8_t sensor)
 {
     uint8_t text[PROTOCOL_TEXT];
@@ -202,8 +202,8 @@ static uint8_t sample(struct bridge *bridge, uint8_t command, uint8_t *word)
     return sound;
 }
 
-/* Sweeps keep their grid: after a late one the next is due at the next whole period, never in a
- * burst. */
+/* Set when the next sweep is due, and count an overrun. Sweeps keep their grid: after a late one
+ * the next is due at the next whole period, never in a burst. */
 static void schedule_next(struct bridge *bridge, uint64_t now_us)
 {
     const uint32_t period_us = bridge->config.period_us;
@@ -268,8 +268,8 @@ static void listen(struct bridge *bridge)
     }
 }
 
-/* Once a second. While sweeping, only those that seem to be gone are looked for: a sensor that
- * samples well is left alone. */
+/* Once a second: send a STATUS and look for sensors. While sweeping, only for those that seem to be
+ * gone: a sensor that samples well is left alone. */
 static void report(struct bridge *bridge, uint64_t now_us)
 {
     send_status(bridge);

@@ -51,7 +51,8 @@ static void put_text(struct writer *writer, const char *text)
     }
 }
 
-/* Two versions must be able to tell each other apart, so these checksums do not hold the digest. */
+/* Initial value of a checksum: the schema's digest, but 0 for HELLO and PING, by which two versions
+ * tell each other apart. */
 static uint32_t crc_start(uint8_t type)
 {
     return type == PROTOCOL_HELLO || type == PROTOCOL_PING ? 0 : PROTOCOL_DIGEST;

@@ -75,7 +75,7 @@ struct protocol_host_frame {
     uint32_t nonce; /* of a PING */
 };
 
-/* Receives the host's frames. All zeros to begin with. */
+/* State of receiving the host's frames. All zeros to begin with. */
 struct protocol_receiver {
     uint8_t buffer[PROTOCOL_HOST_FRAME_MAX];
     size_t size;

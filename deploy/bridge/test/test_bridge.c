@@ -332,7 +332,7 @@ static void a_sensor_that_samples_well_is_not_asked_for_properties(void)
     send(START, sizeof START);
     run_us(900000);
     events = 0;
-    run_us(101000); /* a STATUS is in it */
+    run_us(101000); /* long enough for a STATUS */
     CHECK(events > 0 && events < LOG_SIZE);
     for (i = 0; i < events; i++) {
         CHECK(event[i].kind != TRANSFER || event[i].value != 0x61);
@@ -385,11 +385,11 @@ static void a_late_bridge_does_not_catch_up_in_a_burst(void)
     set_up(3, 10000);
     send(START, sizeof START);
     run_us(25000);
-    now_ns += 100000000; /* something held it up */
+    now_ns += 100000000; /* the bridge was held up for 100 ms */
     sweeps = bridge.sweeps;
     run_us(1);
     CHECK(bridge.sweeps == sweeps + 1 && bridge.overruns == 1);
-    CHECK(bridge.sweep_due_us % 10000 < 2000); /* on the grid that START began */
+    CHECK(bridge.sweep_due_us % 10000 < 2000); /* on the grid of periods since START */
     run_us(30000);
     CHECK(bridge.sweeps <= sweeps + 1 + 4 && bridge.overruns == 1);
 }
@@ -402,7 +402,7 @@ static void a_link_that_stalls_loses_whole_frames_and_counts_them(void)
 
     set_up(3, 10000);
     send(START, sizeof START);
-    link_room = 500; /* in the middle of a frame */
+    link_room = 500; /* the link stalls in the middle of a frame */
     run_us(600000);
     CHECK(bridge.tx_dropped > 0 && from_bridge_size == 500);
     while (!bridge.hello_asked &&

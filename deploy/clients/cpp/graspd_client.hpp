@@ -49,18 +49,18 @@ constexpr double REAL_MAX = 1e12;                              // as a time, thi
 constexpr double WAIT_MAX_S = 1e9;                             // of a call: thirty years
 // A verdict has 0.7 kB, at most 3; a peer that sends more is not a daemon and is disconnected.
 constexpr std::size_t MESSAGE_MAX_BYTES = 1 << 16;
-// Of lists and objects in a message, and so its depth; a verdict has ten.
+// Most lists and objects in a message, and so its greatest depth; a verdict has ten.
 constexpr std::ptrdiff_t OPENINGS_MAX = 100;
 constexpr int QUEUE_MAX = 1000;  // messages that wait to be read: ten seconds at 100 Hz
 // A client that has not read for longer reconnects, because its queue is old and full.
 constexpr Nanoseconds READ_WITHIN_NS = 5'000'000'000;
-// A client without a message for this long reconnects, at first and at most: libzmq does not try
-// a refused peer again, which may be let in by now.
+// Shortest and longest time without a message after which a client reconnects. libzmq does not
+// retry after a refusal, but the daemon may admit the client by then.
 constexpr Nanoseconds QUIET_NS = 1'000'000'000, QUIET_MAX_NS = 10'000'000'000;
 // The computer has slept if its two clocks differ by more. A sleep takes seconds, the
 // scheduler a moment between two looks at the clocks.
 constexpr Nanoseconds SLEPT_NS = 50'000'000;
-// Longest wait in one piece: so well is it known when a message came from another computer.
+// Longest wait in one piece, and so the error of the time when another computer's message came.
 constexpr std::int64_t SLICE_MS = 10;
 // Most by which a message's time may be in the future while the clocks count as the same.
 constexpr Nanoseconds CLOCK_SLACK_NS = 1'000'000;
@@ -85,7 +85,7 @@ constexpr std::size_t LEAVING_MAX = 4;
 // graspd's decision about a grasp; the numbers are those of `verdict_code`.
 enum class Decision { unknown = 0, stable = 1, slip = 2 };
 
-// The wire's word for it.
+// The word for a decision in messages.
 inline const char* name(Decision decision) {
     constexpr const char* names[] = {"unknown", "stable", "slip"};
     return names[static_cast<int>(decision)];
@@ -94,7 +94,7 @@ inline const char* name(Decision decision) {
 // State of a finger.
 enum class FingerState { free, touch, slide };
 
-// The wire's word for it.
+// The word for a finger's state in messages.
 inline const char* name(FingerState state) {
     constexpr const char* names[] = {"free", "touch", "slide"};
     return names[static_cast<int>(state)];
@@ -124,7 +124,7 @@ struct Verdict {
     std::optional<std::int64_t> seq;
     std::string boot_id;                 // empty before the first message
     std::optional<double> age_ms;        // least time since the reading's last byte
-    std::optional<double> p_slip_model;  // `p_slip` by the network alone
+    std::optional<double> p_slip_model;  // `p_slip` by the model alone
     std::int64_t outcomes = 0;           // number of outcomes that `p_slip` rests on
     bool supervised = false;             // graspd would learn from the lift; a person must watch
     std::optional<Risk> risk;
@@ -167,27 +167,27 @@ struct LiftAnswer {
     explicit operator bool() const { return static_cast<bool>(verdict) || supervised; }
 };
 
-// Answer about a lift by its fingers. True in an `if` exactly when it must be stopped.
+// Result of watching a lift by its fingers. True in an `if` exactly when it must be stopped.
 struct SlideAnswer {
     Verdict verdict;  // the newest; its `fingers` and `reasons` say what is known
     double waited_s = 0.0;
     std::vector<std::string> sliding = {};  // fingers along which something slides
-    // True if until the timeout nothing slid and each finger that touched still touches.
+    // True if fingers touched and until the timeout all of these still do and nothing slid.
     bool held = false;
 
     explicit operator bool() const { return !held; }
 };
 
-// Answer to an outcome. True in an `if` exactly when graspd has taken it.
+// Answer to a reported outcome. True in an `if` exactly when graspd has accepted it.
 struct OutcomeAnswer {
-    // Why it was not taken: the daemon's text, or `no-answer`, `malformed`, `version` or
+    // Why it was not accepted: the daemon's text, or `no-answer`, `malformed`, `version` or
     // `other-process`.
     std::string why;
 
     explicit operator bool() const { return why.empty(); }
 };
 
-// Numbers of messages since the start.
+// Numbers of messages since the client was made.
 struct Counts {
     std::int64_t messages = 0;   // new messages of this hand
     std::uint64_t lost = 0;      // messages missing by gaps in `seq`
@@ -233,7 +233,7 @@ struct Options {
     // A `stable` with this `p_slip` or more counts as unknown. Pass the scene's `slip_threshold` if
     // that is higher.
     double max_p_slip = 0.5;
-    // Called for allowed lifts whose outcome was not reported: for the first and each tenth.
+    // Called for allowed lifts whose outcome was not reported: for the first and every ten later.
     std::function<void(const std::string&)> warn = [](const std::string& text) {
         std::cerr << "graspd_client: " << text << '\n';
     };
@@ -249,7 +249,7 @@ inline Nanoseconds now_ns(clockid_t clock = CLOCK_MONOTONIC) {
     return static_cast<Nanoseconds>(now.tv_sec) * 1'000'000'000 + now.tv_nsec;
 }
 
-// Returns the time slept plus a constant, ns: the difference of two clocks.
+// Returns how long the computer has slept, plus a constant, ns: the difference of two clocks.
 inline Nanoseconds slept_ns() {
     const Nanoseconds awake_and_asleep_ns = now_ns(CLOCK_BOOTTIME);
     return awake_and_asleep_ns - now_ns();
@@ -358,7 +358,7 @@ inline std::vector<std::string> feeling(const Verdict& said, FingerState state) 
     return found;
 }
 
-// Reads the fields that daemons without stillness leave out.
+// Reads the fields that daemons without stillness leave out: `early` to `owner` of a verdict.
 inline void stillness(const json& told, Verdict& found) {
     const auto early = told.find("early");
     if (early != told.end()) {
@@ -410,8 +410,8 @@ inline Message message(const json& told) {
     return all;
 }
 
-// Returns a JSON object, or a value that is not an object for other text and for a repeated key,
-// of which readers differ.
+// Returns a JSON object, or a value that is not an object for other text and for a repeated key, on
+// which readers disagree.
 inline json parsed(std::string_view payload) {
     const auto opens = [](char c) { return c == '[' || c == '{'; };
     // A byte order mark is passed over by the parser, and a NUL is its end.
@@ -510,7 +510,7 @@ public:
     Counts counts;
     bool may_be_announced = false;  // the lift that the last answer was about
 
-    // Longest time without a message before the grasp is unknown, ns; 0 without a message.
+    // Longest silence before the grasp is unknown, ns; 0 without a message.
     Nanoseconds silence_ns() const { return message_ ? message_->silence_ns : 0; }
 
     // Forget the message and the clocks' difference; still recognise repeats.
@@ -528,8 +528,9 @@ public:
         bound_ = {least_ns, asked_ns};
     }
 
-    // Take in a message that arrived after `empty_ns` and by `now_ns` (own clock). Returns false
-    // for a repeated message, true for a new one, understood or not.
+    // Take in a message that arrived after `empty_ns` and by `now_ns` (own clock). Returns true for
+    // a new one, understood or not; false for a repeat, or one of another hand or of an earlier
+    // start of the daemon.
     bool take(const std::vector<std::string_view>& frames, Nanoseconds empty_ns,
               Nanoseconds now_ns) {
         if (frames.empty() || frames[0] != topic_) return false;
@@ -579,7 +580,7 @@ public:
         if (ended_.size() > LIFTS_MAX) ended_.pop_front();
     }
 
-    // Returns an answer; none if it is not understood.
+    // Parses an answer to `lift`, and notes if its lift may be announced; none if not understood.
     std::optional<Verdict> answered(std::string_view payload) {
         auto found = read(payload, max_p_slip_).first;
         may_be_announced = !found || found->verdict.decision == Decision::stable ||
@@ -601,7 +602,8 @@ private:
         return std::find(former_.begin(), former_.end(), boot_id) != former_.end();
     }
 
-    // Returns true if it was sent before the known message, so its start is not the newest.
+    // Returns true if a message of another start was sent before the known one; always false if the
+    // daemon has another clock.
     bool is_older(const Message& message) const {
         return same_computer_ && published_ns_ && message.published_ns < *published_ns_;
     }
@@ -627,7 +629,8 @@ private:
         return true;
     }
 
-    // Returns the lower bound of the clocks' difference at `now_ns`, ns, with drift since `bound`.
+    // Returns the least difference of own and daemon's clock at `now_ns`, ns: that of `bound`
+    // (difference, its time) less the drift since.
     static Nanoseconds at_least(const std::pair<Nanoseconds, Nanoseconds>& bound,
                                 Nanoseconds now_ns) {
         return bound.first - std::llrint(static_cast<double>(now_ns - bound.second) * DRIFT);
@@ -684,7 +687,7 @@ auto uninterrupted(const Call& call) {
     }
 }
 
-// Returns the next message; none if none waits.
+// Receives the next message into `frames`; false if none waits.
 inline bool received(zmq::socket_t& socket, std::vector<zmq::message_t>& frames) {
     frames.clear();
     do {
@@ -700,7 +703,7 @@ inline bool received(zmq::socket_t& socket, std::vector<zmq::message_t>& frames)
 struct Call {
     zmq::socket_t socket;
 
-    // Returns the answer; none: not yet; empty: it is not an answer.
+    // Returns the answer; none if none has come yet, empty if it is not a single frame.
     std::optional<std::string> answer() {
         std::vector<zmq::message_t> frames;
         if (!socket || !received(socket, frames)) return std::nullopt;
@@ -722,7 +725,7 @@ public:
 
     bool receive(std::vector<zmq::message_t>& frames) { return received(socket_, frames); }
 
-    // Waits for a message or an answer, up to the time given; a signal ends it sooner.
+    // Waits for a message or an answer, at most `timeout_ms`; a signal ends it sooner.
     void wait(std::int64_t timeout_ms) {
         std::vector<zmq_pollitem_t> items;
         for (zmq::socket_t* each : {&socket_, &asking.socket, &telling.socket})
@@ -737,7 +740,7 @@ public:
             [&] { return call.socket.send(zmq::buffer(question), zmq::send_flags::dontwait); });
     }
 
-    // Report that no lift follows the question, and close the socket.
+    // Report that no lift follows the question; its socket closes when that is sent.
     void take_back(Call& call) {
         if (!call.socket) return;
         call.socket.set(zmq::sockopt::linger, TAKE_BACK_MS);
@@ -749,7 +752,7 @@ public:
         leaving_.pop_front();
     }
 
-    // Reconnect, and forget waiting messages.
+    // Reconnect the subscriber, and drop its waiting messages.
     void renew() {
         socket_.close();
         socket_ = connected(zmq::socket_type::sub, options_.endpoint);
@@ -800,7 +803,7 @@ public:
     Call asking, telling, timing;  // closed before the context
 };
 
-// Deletes what it made, but not in a forked process: ZeroMQ's thread is the parent's alone.
+// Deletes a link, but not in a forked process: ZeroMQ's thread is the parent's alone.
 struct Owner {
     pid_t pid = getpid();
 
@@ -811,12 +814,13 @@ struct Owner {
     }
 };
 
-// Returns true if the newest message is older than the answer.
+// Returns true if the newest message is older than the answer, or of another start of the daemon.
 inline bool is_behind(const Verdict& newest, const Verdict& answer) {
     return newest.boot_id != answer.boot_id || !newest.seq || *newest.seq < *answer.seq;
 }
 
-// One question at a time, until the newest message confirms the answer that permits a lift.
+// `may_i_lift`: asks one question at a time until the newest message confirms an answer that
+// permits a lift.
 class Question {
 public:
     Question(Newest& newest, Link& link, bool asks, bool supervised,
@@ -842,7 +846,8 @@ public:
         return said.decision == Decision::slip || permits(said);
     }
 
-    // Returns the newest verdict if it confirms the answer, else an unknown one; asks if needed.
+    // Returns the newest verdict if it confirms the answer, else an unknown one; asks if needed. An
+    // answered `slip` is returned at once. Without an ask endpoint `newest` decides alone.
     Verdict decided(Verdict newest) {
         newest = if_still(std::move(newest));
         if (!asks_) return newest;
@@ -1057,7 +1062,7 @@ private:
     // Returns true in the process that made the client, false in a fork of it.
     bool is_here() const { return link_.get_deleter().is_here(); }
 
-    // Returns the newest verdict; waits for a new message at most until then.
+    // Returns the newest verdict; waits for a new message at most until `due_ns`.
     Verdict next_verdict(Nanoseconds due_ns) {
         if (!is_here()) return Verdict{}.unknown({"other-process"});
         while (!drain() && wait(due_ns)) {}
@@ -1112,7 +1117,7 @@ private:
         for (auto& [grasp, told] : lifts_) told = told || (*told_ && grasp == telling_);
     }
 
-    // Ask another computer's daemon for its clock once a second, and take in the answer.
+    // Ask another computer's daemon for its clock if that is due, and take in the answer.
     void compare_clocks() {
         if (!compares_clocks_) return;
         const Nanoseconds now_ns = detail::now_ns();
@@ -1134,7 +1139,8 @@ private:
         link_->ask(link_->timing, "clock");
     }
 
-    // Read all waiting messages without blocking; returns true if one was new.
+    // Read waiting messages, at most `QUEUE_MAX`, without blocking; returns true if one was new.
+    // Also takes in answers to outcomes and for clocks, and reconnects after a long silence.
     bool drain() {
         bool anything_new = false;
         const Nanoseconds heard_ns = forget_what_is_old();

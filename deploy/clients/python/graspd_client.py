@@ -95,7 +95,7 @@ _OBJECT_IS = f"1 to {OBJECT_MAX} ASCII letters, digits, _, -, ., the first no - 
 
 _T = TypeVar("_T")
 Waits = Generator[int, None, _T]
-"""A call, step by step: it yields for how long to wait for a message, ms, before the next step."""
+"""A call in steps: yields the longest time to wait for a message, ms, before the next step."""
 
 log = logging.getLogger("graspd_client")
 
@@ -155,7 +155,7 @@ class Verdict:
 
     `decision` is `stable`, `slip` or `unknown`. `reasons` say why it is unknown: the daemon's, or
     one of those in deploy/clients/README.md. `p_slip` is the probability of slip after learning
-    from `outcomes` lifts, `p_slip_model` that of the network alone; both are None when unknown.
+    from `outcomes` lifts, `p_slip_model` that of the model alone; both are None when unknown.
     `grasp` is the number of the contact episode, `age_ms` at least the time since the reading's
     last byte. `supervised`: graspd would learn from the lift; lift only while a person watches.
     `early`: it was judged when nothing moved fast, but something might still slide slowly.
@@ -210,7 +210,7 @@ class LiftAnswer:
 
 @dataclass(frozen=True)
 class SlideAnswer:
-    """Answer about a lift by its fingers. True in an `if` exactly when it must be stopped."""
+    """Result of watching a lift by its fingers. True in an `if` exactly when it must be stopped."""
 
     verdict: Verdict
     """Newest verdict; its `fingers` and `reasons` say what is known."""
@@ -218,7 +218,7 @@ class SlideAnswer:
     sliding: tuple[str, ...] = ()
     """Fingers along which something slides."""
     held: bool = False
-    """True if until the timeout nothing slid and each finger that touched still touches."""
+    """True if fingers touched and until the timeout all of these still do and nothing slid."""
 
     def __bool__(self) -> bool:
         return not self.held
@@ -226,10 +226,10 @@ class SlideAnswer:
 
 @dataclass(frozen=True)
 class OutcomeAnswer:
-    """Answer to an outcome. True in an `if` exactly when graspd has taken it."""
+    """Answer to a reported outcome. True in an `if` exactly when graspd has accepted it."""
 
     why: str = ""
-    """Why it was not taken: the daemon's text, or a reason of deploy/clients/README.md."""
+    """Why it was not accepted: the daemon's text, or a reason of deploy/clients/README.md."""
 
     def __bool__(self) -> bool:
         return not self.why
@@ -237,7 +237,7 @@ class OutcomeAnswer:
 
 @dataclass
 class Counts:
-    """Numbers of messages since the start."""
+    """Numbers of messages since the client was made."""
 
     messages: int = 0  # new messages of this hand
     lost: int = 0  # messages missing by gaps in `seq`
@@ -268,7 +268,7 @@ class Keys(NamedTuple):
 
 
 class _Hand:
-    """Subscribes to the verdicts of one hand. Calls do not wait themselves: see `Waits`."""
+    """Base of both clients: verdicts of one hand. Its calls do not wait themselves: see `Waits`."""
 
     def __init__(
         self,
@@ -333,8 +333,8 @@ class _Hand:
     def unreported(self) -> int:
         """Number of lifts, before the last allowed one, of which graspd has no outcome.
 
-        It cannot learn from them. With `[risk]` one that was asked for and is never reported counts
-        as a slip. The logger `graspd_client` warns of the first one and of each tenth.
+        graspd cannot learn from them. With `[risk]` a lift that was asked for and is never reported
+        counts as a slip. The logger `graspd_client` warns of the first one and every ten later.
         """
         untold = (key != self._last for key, told in self._lifts.items() if not told)
         return self._forgotten + sum(untold)
@@ -459,7 +459,7 @@ class _Hand:
 
     @contextmanager
     def _one_call(self, steps: Waits[Any]) -> Iterator[None]:
-        """Refuse a call after a fork, and a second call."""
+        """Run a call in a block. Raises `RuntimeError` after a fork and during another call."""
         self._refuse_fork()
         if not self._turn.acquire(blocking=False):
             raise RuntimeError("another call is under way: one call at a time, or two clients")
@@ -472,7 +472,8 @@ class _Hand:
                 self._close_if_idle()
 
     def _allow(self, lift: tuple[str, int]) -> None:
-        """Note that the hand may lift this grasp. The outcome of the lift before is now overdue."""
+        """Note that the hand may lift this grasp, ("", 0): none. The outcome of the lift before is
+        now overdue."""
         self._last = lift
         if lift[1]:
             self._lifts.setdefault(lift, False)
@@ -495,7 +496,7 @@ class _Hand:
         self._telling = "", 0
 
     def _compare_clocks(self) -> None:
-        """Ask another computer's daemon for its clock once a second, and take in the answer."""
+        """Ask another computer's daemon for its clock if that is due, and take in the answer."""
         if not self._compares_clocks:
             return
         calling, now_ns = self._link.timing, time.monotonic_ns()
@@ -514,7 +515,10 @@ class _Hand:
             calling.ask(b"clock")
 
     def _drain(self) -> bool:
-        """Read all waiting messages without blocking; return True if one was new."""
+        """Read waiting messages, at most `QUEUE_MAX`, without blocking; return True if one was new.
+
+        Also takes in answers to outcomes and for clocks, and reconnects after a long silence.
+        """
         self._forget_what_is_old()
         self._hear()
         self._compare_clocks()
@@ -538,8 +542,8 @@ class _Hand:
         return new
 
     def _forget_what_is_old(self) -> None:
-        """Forget messages from before a sleep of the computer, or a long time without a look. The
-        monotonic clock stops in a sleep, so all messages would look fresh."""
+        """Forget the newest message after a sleep of the computer, in which the monotonic clock
+        stops. Reconnect then, and after a long time without reading."""
         slept_ns = _slept_ns()
         slept = slept_ns - self._slept_ns > SLEPT_NS
         self._slept_ns = max(self._slept_ns, slept_ns)
@@ -555,7 +559,7 @@ class _Hand:
         self._empty_ns = self._heard_ns = time.monotonic_ns()
 
     def _wait(self, due_ns: int, look_ns: int | None = None) -> Waits[bool]:
-        """Wait for a message or until `look_ns`; return False at `due_ns`, the end of the call."""
+        """Wait for a message or until `look_ns`; return False from `due_ns` on and once closed."""
         now_ns = time.monotonic_ns()
         if now_ns >= due_ns or self._closed:
             return False
@@ -777,7 +781,7 @@ class Newest:
 
     @property
     def silence_ns(self) -> int:
-        """Longest time without a message before the grasp is unknown, ns; 0 without a message."""
+        """Longest silence before the grasp is unknown, ns; 0 without a message."""
         return 0 if self._message is None else self._message.silence_ns
 
     @property
@@ -800,14 +804,15 @@ class Newest:
 
     @staticmethod
     def _at_least(bound: tuple[int, int], now_ns: int) -> int:
-        """Return the lower bound of the clocks' difference at `now_ns`, ns, with drift since
-        `bound`."""
+        """Return the least difference of own and daemon's clock at `now_ns`, ns: that of `bound`
+        (difference, its time) less the drift since."""
         return bound[0] - round((now_ns - bound[1]) * DRIFT)
 
     def take(self, frames: Sequence[bytes], empty_ns: int, now_ns: int) -> bool:
         """Take in a message that arrived after `empty_ns` and by `now_ns` (own clock).
 
-        Return False for a repeated message, True for a new one, understood or not.
+        Return True for a new one, understood or not; False for a repeat, or one of another hand or
+        of an earlier start of the daemon.
         """
         if not frames or frames[0] != self._topic:
             return False
@@ -859,7 +864,8 @@ class Newest:
         return said.unknown("outcome-told") if ended else said
 
     def read(self, payload: bytes) -> _Message | str:
-        """Return a message or an answer; count others and return `malformed` or `version`."""
+        """Parse a message or an answer; count one not understood, and return why: `malformed` or
+        `version`."""
         try:
             told = _parsed(payload)
             if _number(told, "v") == VERSION:
@@ -898,7 +904,8 @@ class Newest:
         return True
 
     def _is_older(self, found: _Message) -> bool:
-        """Return True if it was sent before the known message, so its start is not the newest."""
+        """Return True if a message of another start was sent before the known one; always False if
+        the daemon has another clock."""
         known_ns = self._published_ns if self._same_computer else None
         return known_ns is not None and found.published_ns < known_ns
 
@@ -926,7 +933,8 @@ class Newest:
 
 
 class _Question:
-    """One question at a time, until the newest message confirms the answer that permits a lift."""
+    """`may_i_lift`: asks one question at a time until the newest message confirms an answer that
+    permits a lift."""
 
     def __init__(
         self, newest: Newest, asking: _Call | None, supervised: bool, still_ms: float | None
@@ -946,7 +954,10 @@ class _Question:
         return said.decision == Decision.SLIP or self.permits(said)
 
     def decided(self, newest: Verdict) -> Verdict:
-        """Return the newest verdict if it confirms the answer, else an unknown; ask if needed."""
+        """Return the newest verdict if it confirms the answer, else an unknown; ask if needed.
+
+        An answered `slip` is returned at once. Without an ask endpoint `newest` decides alone.
+        """
         newest = self._if_still(newest)
         if self._asking is None:
             return newest
@@ -996,12 +1007,12 @@ class _Question:
 
 
 def _was_stable(said: Verdict) -> bool:
-    """Return True if the daemon said `stable`, even if `p_slip` is too high."""
+    """Return True if the daemon said `stable`, even if the client refused its `p_slip`."""
     return said.decision == Decision.STABLE or said.reasons == ("p-slip",)
 
 
 def _reaches(newest: Verdict, answer: Verdict) -> bool:
-    """Return True if the newest message is at least as new as the answer."""
+    """Return True if the newest message is of the answer's start, and at least as new."""
     return newest.boot_id == answer.boot_id and (newest.seq or 0) >= (answer.seq or 0)
 
 
@@ -1038,12 +1049,12 @@ class _Link:
         zmq.zmq_poll([(each, zmq.POLLIN) for each in self.sockets], timeout_ms)
 
     def renew(self) -> None:
-        """Reconnect, and forget waiting messages."""
+        """Reconnect the subscriber, and drop its waiting messages."""
         self._socket.close(0)
         self._socket = self.connected(zmq.SUB, self._endpoint)
 
     def leave(self, socket: zmq.Socket[bytes]) -> None:
-        """Keep a socket open until its last message is sent."""
+        """Keep a socket open until its last message is sent; close the oldest if there are many."""
         self._leaving.append(socket)
         if len(self._leaving) > LEAVING_MAX:
             self._leaving.popleft().close(0)
@@ -1072,7 +1083,7 @@ class _Link:
 
 
 def _close_in(process: int, link: _Link) -> None:
-    """Close the sockets of a client that was dropped, in the process that made them."""
+    """Close the sockets of a client that was dropped; in another process do nothing."""
     if os.getpid() == process:
         link.close()
 
@@ -1090,7 +1101,7 @@ class _Call:
         self.socket.send(question, zmq.NOBLOCK)
 
     def answer(self) -> bytes | None:
-        """Return the answer; None: not yet; b"": it is not an answer."""
+        """Return the answer; None if none has come yet, b"" if it is not a single frame."""
         try:
             frames = [] if self.socket is None else self.socket.recv_multipart(zmq.NOBLOCK)
         except zmq.Again:
@@ -1119,7 +1130,7 @@ def is_same_computer(endpoint: str) -> bool:
 
 
 def _due_ns(name: str, seconds: float) -> int:
-    """Return the time when a wait of `seconds` ends, ns. Raises `ValueError`."""
+    """Return the monotonic time when a wait of `seconds` ends, ns. Raises `ValueError`."""
     if not _is_amount(seconds, WAIT_MAX_S):
         raise ValueError(f"{name} must be 0 or more and finite, not {seconds!r}")
     return time.monotonic_ns() + round(seconds * 1e9)
@@ -1133,12 +1144,13 @@ def _is_amount(value: object, most: float = REAL_MAX) -> bool:
 
 
 def _slept_ns() -> int:
-    """Return the time slept plus a constant, ns: the difference of two clocks."""
+    """Return how long the computer has slept, plus a constant, ns: the difference of two clocks."""
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.monotonic_ns()
 
 
 def _parsed(payload: bytes) -> dict[str, Any]:
-    """Return a JSON object without repeated keys. Raises `ValueError` or `RecursionError`."""
+    """Return the JSON object in a payload. Raises `ValueError` or `RecursionError` for any other,
+    too long or deep, or with repeated keys."""
     openings = payload.count(b"[") + payload.count(b"{")
     if len(payload) > MESSAGE_MAX_BYTES or openings > OPENINGS_MAX:
         raise ValueError
@@ -1151,7 +1163,7 @@ def _parsed(payload: bytes) -> dict[str, Any]:
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return the object. Raises `ValueError` for a repeated key, of which readers differ."""
+    """Return the pairs as an object. Raises `ValueError` for a repeated key: readers disagree."""
     found = dict(pairs)
     if len(found) != len(pairs):
         raise ValueError
@@ -1188,7 +1200,7 @@ def _message(told: dict[str, Any]) -> _Message:
 
 
 def _with_stillness(said: Verdict, told: dict[str, Any]) -> Verdict:
-    """Return the verdict with the message's stillness and motion, which older daemons lack."""
+    """Return the verdict with the message's fields from `early` on, which older daemons lack."""
     told = {"early": False, "still_ms": None, "motion": None, "motion_limits": None, **told}
     told = {"fingers": None, "owner": None, **told}
     if not isinstance(told["early"], bool) or not isinstance(told["owner"], (str, type(None))):
@@ -1205,7 +1217,7 @@ def _with_stillness(said: Verdict, told: dict[str, Any]) -> Verdict:
 
 
 def _by_finger(told: Any, read: Callable[[dict[str, Any], str], Any]) -> Any:  # noqa: ANN401
-    """Return an object by finger, each value read by `read`; None for null."""
+    """Return an object by finger, each value read by `read(told, finger)`; None for null."""
     if told is None:
         return None
     if not isinstance(told, dict):
@@ -1240,7 +1252,8 @@ def _risk(told: Any) -> Risk:  # noqa: ANN401
 
 
 def _telling(lifted_on: Verdict, how: Outcome, object_name: str | None) -> bytes:
-    """Return the message to send. Raises `ValueError`."""
+    """Return the message that reports an outcome. Raises `ValueError` without a grasp, or for a
+    wrong name."""
     boot_id, grasp = _key(lifted_on)
     if not boot_id or not grasp:
         raise ValueError("nothing was lifted on a verdict that is of no grasp")
@@ -1294,7 +1307,7 @@ def _maybe(told: dict[str, Any], name: str, most: float = REAL_MAX) -> float | N
 def _number(
     told: dict[str, Any], name: str, most: float = INTEGER_MAX, kinds: tuple[type, ...] = (int,)
 ) -> Any:  # noqa: ANN401
-    """Return a value of one of these types, but not bool, from 0 to `most`."""
+    """Return the field `name`. Raises `ValueError` if it is not of `kinds` and from 0 to `most`."""
     value = told[name]
     if type(value) not in kinds or not 0 <= value <= most:
         raise ValueError

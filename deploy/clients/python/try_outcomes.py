@@ -13,7 +13,10 @@ VERDICTS, QUESTIONS = "ipc:///tmp/graspd-loop.ipc", "ipc:///tmp/graspd-loop.ask.
 
 
 def asked() -> Outcome:
-    """Return the outcome that a person types: y or h for held, n or s for slipped."""
+    """Return the outcome that a person types: y or h for held, n or s for slipped.
+
+    `NOT_LIFTED` at the end of the input.
+    """
     while True:
         sys.stdout.write("Did it hold? y/n ")
         sys.stdout.flush()

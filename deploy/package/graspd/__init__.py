@@ -37,12 +37,12 @@ _MODULES = {
 
 
 def __dir__() -> list[str]:
-    """Return the names for users; they are not loaded yet."""
+    """Return the public names, without loading their modules."""
     return list(__all__)
 
 
 def __getattr__(name: str) -> object:
-    """Load the module of a name."""
+    """Return what a public name stands for, and load its module. Raises `AttributeError`."""
     if name == "__version__":
         return import_module("graspd.daemon").version()
     if name == "client":

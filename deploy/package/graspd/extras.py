@@ -21,7 +21,10 @@ def require(package: str, what: str, extra: str) -> None:
 
 
 def needs(what: str, extra: str, error: ModuleNotFoundError) -> str:
-    """Return how to install the missing `extra`. Raises `error` for a module of graspd."""
+    """Return text that `what` needs a package, and how to install its `extra`.
+
+    Raises `error` if it is about a module of graspd itself.
+    """
     package = (error.name or "").partition(".")[0]
     if package == "graspd":
         raise error
