@@ -1,4 +1,4 @@
-"""A real daemon for the clients' tests: a hand that holds on, for as long as the test lasts."""
+"""A real daemon for the clients' tests, whose hand holds an object until the test ends."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ RATE_HZ = 100
 
 
 class Daemon:
-    """`graspd run`, with sockets in a folder."""
+    """Process of `graspd run`, with its scene and sockets in a folder; killed after the block."""
 
     def __init__(
         self,
@@ -28,10 +28,10 @@ class Daemon:
         recording: Path | None = None,
         endpoint: str | None = None,
     ) -> None:
-        """Judges each row of the demo table; with `whole_grasps`, one from touch to lift; or
-        what the `recording` has.
+        """Start a daemon on a `recording`; None: the demo table, whose rows are grasps, or with
+        `whole_grasps` one stable grasp from touch to lift.
 
-        `more` is what else there is in the scene, from `[tactile]` on.
+        `more`: the scene's lines after those of `[tactile]`. `endpoint` None: `out` in `folder`.
         """
         self.endpoint = endpoint or f"ipc://{folder}/out"
         self.ask_endpoint = f"ipc://{folder}/ask"
@@ -47,18 +47,18 @@ class Daemon:
         self.start()
 
     def start(self) -> None:
-        """Start it, and wait for its first message."""
+        """Start the process, and wait until its ask socket exists."""
         bound = self._folder / "ask"
         bound.unlink(missing_ok=True)
         self._process = start("run", self._scene)
         wait_for(bound)
 
     def send(self, number: signal.Signals) -> None:
-        """Send it a signal."""
+        """Send the process a signal."""
         os.kill(self._process.pid, number)
 
     def kill(self) -> None:
-        """End it without a word."""
+        """Kill the process, and wait for its end."""
         self._process.kill()
         self._process.communicate(timeout=TIMEOUT_S)
 
@@ -70,7 +70,7 @@ class Daemon:
 
 
 def _one_grasp(path: Path) -> Path:
-    """Write a recording of a grasp that is stable, so that no test waits for it."""
+    """Write a recording of only one grasp, which is stable, so that no test waits for one."""
     head, *rows = DEMO_RECORDING.read_text().splitlines()
     kept = [row.partition(",")[2] for row in rows[REST] + rows[GRASP]]
     lines = [f"{number / RATE_HZ},{row}" for number, row in enumerate(kept)]
@@ -79,5 +79,5 @@ def _one_grasp(path: Path) -> Path:
 
 
 def free_endpoint() -> str:
-    """A place on the loopback address that is free just now."""
+    """Return a TCP endpoint on the loopback address whose port is free now."""
     return f"tcp://127.0.0.1:{free_port()}"

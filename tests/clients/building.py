@@ -1,6 +1,6 @@
-"""Compiling the C++ client, as its Makefile does, and driving it by the orders of probe.cpp.
+"""Compile the C++ client, as its Makefile does, and drive it by the orders of probe.cpp.
 
-What was compiled is kept by its content.
+Programs are cached by a checksum of their sources and compiler.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ CPP = ROOT / "deploy" / "clients" / "cpp"
 KEPT = Path.home() / ".cache" / "graspd-tests"
 Words = Sequence[str | Path]
 HEADERS = {"zmq_addon.hpp": "cppzmq-dev", "nlohmann/json.hpp": "nlohmann-json3-dev"}
-"""What the client includes, and the Debian package that has it."""
+"""Headers that the client includes, and the Debian packages that have them."""
 
 
 def lacking() -> list[str]:
-    """What is missing to compile it."""
+    """Return the Debian packages that are missing to compile the client; [] if none is."""
     missing = [package for header, package in HEADERS.items() if not _is_there(header)]
     return missing + [tool for tool in ("g++", "make") if shutil.which(tool) is None]
 
 
 def skip_unless_it_can_be_compiled() -> None:
-    """Skip, and say what is missing."""
+    """Skip the test if the C++ client cannot be compiled here, and say what is missing."""
     if missing := lacking():
         pytest.skip(f"no C++ client without it: apt install {' '.join(missing)}")
 
@@ -43,7 +43,7 @@ def _is_there(header: str) -> bool:
 
 
 def compiled(name: str) -> Path:
-    """The example of that name, made by the Makefile with its warnings as errors."""
+    """Return the example program `name`, made by the client's Makefile; cached."""
     skip_unless_it_can_be_compiled()
     return kept(
         lambda folder: ["make", "-s", "-C", CPP, f"BUILD={folder}", "CXXFLAGS=-O0", folder / name],
@@ -52,10 +52,10 @@ def compiled(name: str) -> Path:
 
 
 def kept(command: Callable[[Path], Words], name: str) -> Path:
-    """The program `name`, which `command` makes in the folder that it is given.
+    """Return the program `name`; if not cached, run `command(folder)`, which makes it there.
 
-    It is kept as long as sources and compiler stay the same. One process makes it, in four
-    seconds, while others wait.
+    The cache is valid while sources and compiler stay the same. One process makes the program, in
+    four seconds, while others wait.
     """
     sources = [
         *CPP.glob("*.?pp"),
@@ -79,7 +79,8 @@ def kept(command: Callable[[Path], Words], name: str) -> Path:
 
 
 def sleep_at_will(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The file of which programs started from now on take the beginning for a computer's sleep."""
+    """Return a path: once a file is there, programs started from now on see that the computer has
+    slept for an hour."""
     skip_unless_it_can_be_compiled()
     source = Path(__file__).parent / "sleep.c"
     words: Words = ["gcc", "-shared", "-fPIC", "-Wall", "-Werror", source, "-o"]
@@ -91,7 +92,7 @@ def sleep_at_will(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def asked(program: Path, *words: object, typed: str = "") -> subprocess.CompletedProcess[str]:
-    """Run a program to its end."""
+    """Run a program to its end, with `words` as arguments and `typed` as its input."""
     command = [str(program), *map(str, words)]
     return subprocess.run(
         command, capture_output=True, text=True, timeout=200, check=False, input=typed
@@ -99,7 +100,7 @@ def asked(program: Path, *words: object, typed: str = "") -> subprocess.Complete
 
 
 def compiled_probe(name: str = "probe") -> Path:
-    """The probe that tells what the header's rules say, or another program beside it."""
+    """Return the program probe.cpp, compiled with sanitizers, or another of this folder."""
     skip_unless_it_can_be_compiled()
     warnings = ["-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror"]
     sanitizers = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
@@ -119,18 +120,18 @@ def compiled_probe(name: str = "probe") -> Path:
 
 
 class Probe:
-    """A running probe."""
+    """A running program of probe.cpp, driven by lines."""
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self._process = process
 
     def tell(self, *words: object) -> None:
-        """Give it an order, which it reads after the next `flush`."""
+        """Give the probe an order, which it reads after the next `flush`."""
         assert self._process.stdin is not None
         self._process.stdin.write(" ".join(map(str, words)) + "\n")
 
     def ask(self, *words: object) -> str:
-        """Give it an order; return the first line of its answer."""
+        """Give the probe an order; return the first line of its answer."""
         self.tell(*words)
         self.flush()
         return self.line()
@@ -140,7 +141,7 @@ class Probe:
         self._process.stdin.flush()
 
     def line(self) -> str:
-        """Return the next line that it writes."""
+        """Wait for the next line that the probe writes, and return it; "" after its end."""
         assert self._process.stdout is not None
         return self._process.stdout.readline().rstrip("\n")
 

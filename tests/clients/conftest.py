@@ -22,7 +22,7 @@ def lift_gate() -> Path:
 
 @pytest.fixture(scope="session")
 def binary() -> Path:
-    """The probe that tells what the header's rules say."""
+    """The compiled program of probe.cpp, which runs the C++ client's rules."""
     return compiled_probe()
 
 
@@ -46,7 +46,7 @@ def cpp(request: pytest.FixtureRequest) -> Probe | None:
 
 @pytest.fixture(params=["python", "cpp"])
 def connect(request: pytest.FixtureRequest) -> Iterator[Connect]:
-    """Makes clients in either language; those in Python are closed after the test."""
+    """Makes clients, in each test run of one language; those in Python are closed afterwards."""
     with ExitStack() as stack:
 
         def made(folder: Path, ask: str | None = "ask") -> Either:

@@ -1,4 +1,4 @@
-"""A client in either language, with the same calls: what holds for one holds for the other."""
+"""The Python and the C++ client behind the same calls, so that one test checks both."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ WAIT_S = 30.0
 
 
 class Grasp(NamedTuple):
-    """What an outcome is told of."""
+    """A grasp whose outcome is reported: start of the daemon, and number."""
 
     boot_id: str
     number: int
@@ -29,7 +29,7 @@ class Said(NamedTuple):
 
     @property
     def word(self) -> str:
-        """`supervised` where it may be lifted so."""
+        """The decision, or `supervised` if the hand may lift under supervision."""
         return "supervised" if self.supervised else self.decision
 
 
@@ -65,7 +65,7 @@ class InPython:
 
 
 class InCpp:
-    """The C++ client, in the probe."""
+    """The C++ client, in the process of the probe."""
 
     def __init__(self, probe: Probe, endpoint: str, ask_endpoint: str | None) -> None:
         self.warned: list[str] = []
@@ -104,4 +104,4 @@ class InCpp:
 
 Either = InPython | InCpp
 Connect = Callable[..., Either]
-"""Makes a client of the sockets `out` and `ask` in a folder; None: it does not ask."""
+"""Makes a client of the sockets `out` and `ask` (None: without) in a folder."""

@@ -1,4 +1,4 @@
-"""A daemon that publishes and answers what a test says, right or wrong."""
+"""A stand-in for the daemon that publishes and answers what a test gives it, right or wrong."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from tests.threads import at_work
 
 PERIOD_MS = 5
 PATIENT_MS = 5000.0
-"""Silence that this thread, on a busy machine, does not need."""
+"""`silence_ms` of the messages, ms: longer than this thread pauses on a busy machine."""
 TAKEN = b'{"v":1,"ok":true}'
 Answer = Callable[[dict[str, Any]], list[bytes]]
-"""What is answered, from the message that has just been published."""
+"""Makes the frames of the answer to `lift` from the message that was published last."""
 
 
 def told(**change: object) -> Answer:
-    """An answer that differs so from what has been published."""
+    """Answer with the message published last, with these fields changed."""
     return lambda published: [json.dumps(published | change).encode()]
 
 
 def of(outcome: str) -> Answer:
-    """The answer of that verdict."""
+    """Answer with a verdict of this outcome on the reading published last."""
     return lambda published: [
         json.dumps(verdict(published["seq"], published["t_mono_ns"], outcome)).encode()
     ]
@@ -44,9 +44,10 @@ def false_daemon(
     taken: Sequence[bytes] = (TAKEN,),
     **more: object,
 ) -> Iterator[list[bytes]]:
-    """Publishes that verdict all the time, with what is `more`, and answers so.
+    """Publish verdicts of `outcome`, with fields `more`, during the block, and answer `lift`.
 
-    The frames of `taken` answer what is told. Gives what it is asked and told.
+    `answer` None: with what was published. Frames `taken` answer an outcome. Yields the list of
+    questions and outcomes received so far.
     """
     heard: list[bytes] = []
     with at_work(partial(_serve, folder, answer or told(), outcome, taken, more, heard)):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 TOPIC = b"verdict.right"
 MS = 1_000_000
 MAX_AGE_NS = 100 * MS
-"""In ns."""
+"""Largest age of a reading that permits a lift, ns."""
 NEEDED = (
     "v", "boot_id", "seq", "t_mono_ns", "grasp", "verdict", "verdict_code", "p_slip", "valid",
     "reasons", "age_ms", "silence_ms",
@@ -26,9 +26,9 @@ ADDED: dict[str, Any] = {
     "early": False, "still_ms": 250.0, "motion": {"ff": 0.9, "th": None},
     "motion_limits": {"ff": 1.5, "th": 1.0}, "fingers": {"ff": "touch", "th": None},
 }  # fmt: skip
-"""What older daemons leave out, as it is of a known grasp."""
+"""Fields that older daemons leave out, with values for a verdict that is not unknown."""
 TEACHES = ADDED | {"p_slip_model": None, "supervised": True, "reasons": ["unproven"]}
-"""The same of an unknown grasp that is to be lifted under supervision."""
+"""The same fields for an unknown verdict whose grasp may be lifted under supervision."""
 
 
 def verdict(
@@ -42,7 +42,7 @@ def verdict(
     silence_ms: float = 100.0,
     **more: Any,  # noqa: ANN401
 ) -> dict[str, Any]:
-    """A message as a daemon makes it that knows nothing of outcomes, with `more` fields."""
+    """Return a verdict message of a daemon that lacks `ADDED`, with `more` fields."""
     known = outcome != "unknown"
     return {
         "v": 1,
@@ -67,7 +67,7 @@ def verdict(
 
 
 def supervised(seq: int = 0, read_ns: int = 0) -> dict[str, Any]:
-    """One of the warm-up: unknown, to be lifted while a person watches."""
+    """Return a verdict message of the warm-up: unknown, to be lifted while a person watches."""
     return verdict(seq, read_ns, "unknown", **TEACHES)
 
 
@@ -78,7 +78,7 @@ def frames(message: dict[str, Any]) -> list[bytes]:
 
 @dataclass(frozen=True)
 class Event:
-    """Something comes, and then time passes."""
+    """The frames of a message that arrives, and the time that passes after it, ns."""
 
     frames: list[bytes]
     wait_ns: int
@@ -98,7 +98,7 @@ _anything = st.one_of(
 
 @st.composite
 def _added(draw: st.DrawFn, known: bool) -> dict[str, Any]:
-    """What daemons that know of outcomes add, or some of it."""
+    """Draw the fields that newer daemons add, or some of them; `known`: verdict not unknown."""
     risk: dict[str, Any] = RISK | {"slips": draw(st.sampled_from([0, 2, 41, 42]))}
     if draw(st.booleans()):
         risk |= {draw(st.sampled_from(sorted(RISK))): draw(_anything)}
@@ -124,7 +124,8 @@ def _added(draw: st.DrawFn, known: bool) -> dict[str, Any]:
 
 @st.composite
 def events(draw: st.DrawFn, broken: bool = True) -> list[Event]:
-    """What may come in a while that begins at 1 s; times of readings are those of one clock."""
+    """Draw messages that arrive one after another from 1 s on, from one clock; `broken`: some with
+    a wrong or missing field."""
     now_ns = 1000 * MS
     seqs = {"a": 0, "b": 0, "c": 0}
     found = []
@@ -155,7 +156,10 @@ def events(draw: st.DrawFn, broken: bool = True) -> list[Event]:
 
 @st.composite
 def _spoiled(draw: st.DrawFn, message: dict[str, Any]) -> list[bytes]:
-    """A field that is wrong or gone; frames that are wrong are in golden/refused.json."""
+    """Draw the frames of the message with a field changed or missing.
+
+    Wrong frames are in golden/refused.json.
+    """
     name = draw(st.sampled_from([*NEEDED, *ADDED]))
     if draw(st.integers(0, 3)):
         return frames(message | {name: draw(_anything)})

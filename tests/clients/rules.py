@@ -1,4 +1,4 @@
-"""The rules of the client in Python and, beside them, those of the C++ client."""
+"""The rules of the Python client and of the C++ client, compared at each step."""
 
 from __future__ import annotations
 
@@ -13,7 +13,10 @@ START_NS = 1000 * MS
 
 
 class Rules:
-    """What comes goes to both, and they must say the same; without `cpp`, to Python's alone."""
+    """Gives each message to both clients' rules, and asserts that they say the same verdict.
+
+    `cpp` None: the Python client's alone.
+    """
 
     def __init__(self, cpp: Probe | None, same_computer: bool = True) -> None:
         self._python = Newest(TOPIC, MAX_AGE_NS, same_computer)
@@ -50,7 +53,7 @@ class Rules:
 
 
 def in_words(verdict: Verdict, counts: Counts) -> str:
-    """What a client says, in the words of the probe."""
+    """Return a verdict and counts as the line that the probe writes for them."""
     place = [-1 if number is None else number for number in (verdict.grasp, verdict.seq)]
     age_ns = round((-1.0 if verdict.age_ms is None else verdict.age_ms) * 1e6)
     words = [verdict.decision, len(verdict.reasons), *verdict.reasons, *place]
@@ -74,5 +77,5 @@ def in_words(verdict: Verdict, counts: Counts) -> str:
 
 
 def _fixed(share: float | None) -> int:
-    """In the ninth place, as the probe writes it."""
+    """Return a share times 1e9, as the probe writes it; -1e9 for None."""
     return round((-1.0 if share is None else share) * 1e9)

@@ -1,4 +1,4 @@
-// `signals CALLS`: signals interrupt each call, then a forked process uses the client->
+// `signals CALLS`: signals interrupt this number of calls, then a forked process uses the client.
 #include "graspd_client.hpp"
 
 #include <csignal>

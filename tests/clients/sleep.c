@@ -1,4 +1,5 @@
-/* For LD_PRELOAD: as soon as the file SLEPT exists, the computer has slept for an hour. */
+/* For LD_PRELOAD: while the file that the variable SLEPT names exists, CLOCK_BOOTTIME is an hour
+ * ahead, as if the computer had slept. */
 #define _GNU_SOURCE
 #include <stdlib.h>
 #include <sys/syscall.h>

@@ -27,7 +27,7 @@ pytestmark = pytest.mark.slow
 
 @contextmanager
 def watching(lift_gate: Path, *words: str | Path) -> Iterator[subprocess.Popen[str]]:
-    """`lift_gate --watch`, as long as the block lasts."""
+    """Run `lift_gate --watch` with these arguments during the block."""
     command = [lift_gate, "--watch", *words]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
@@ -37,7 +37,7 @@ def watching(lift_gate: Path, *words: str | Path) -> Iterator[subprocess.Popen[s
 
 
 def line_with(process: subprocess.Popen[str], *wanted: str) -> list[str]:
-    """Words of the next line with one of these."""
+    """Read lines up to one with any of these words, and return its words."""
     assert process.stdout is not None
     while True:
         words = process.stdout.readline().split()
@@ -51,13 +51,13 @@ def boot_id(words: list[str]) -> str:
 
 
 @pytest.mark.parametrize("ask", ["ask", None])
-def test_a_settled_grasp_is_lifted(connect: Connect, tmp_path: Path, ask: str | None) -> None:
+def test_a_stable_grasp_may_be_lifted(connect: Connect, tmp_path: Path, ask: str | None) -> None:
     with Daemon(tmp_path, whole_grasps=True):
         graspd = connect(tmp_path, ask)
         wait_until(lambda: graspd.lift(1.0).may)
 
 
-def test_over_tcp_as_from_another_computer(tmp_path: Path) -> None:
+def test_over_tcp_without_a_shared_clock_a_lift_is_allowed(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     with (
         Daemon(tmp_path, endpoint=endpoint) as daemon,
@@ -67,7 +67,9 @@ def test_over_tcp_as_from_another_computer(tmp_path: Path) -> None:
         assert (graspd.counts.lost, graspd.counts.malformed) == (0, 0)
 
 
-def test_a_caller_may_ask_for_early_or_settled_verdicts(lift_gate: Path, tmp_path: Path) -> None:
+def test_early_verdicts_allow_lifts_unless_stillness_is_required(
+    lift_gate: Path, tmp_path: Path
+) -> None:
     with (
         Daemon(tmp_path, "[gate]\nearly = true\n", whole_grasps=True) as daemon,
         Client(daemon.endpoint) as graspd,
@@ -85,7 +87,9 @@ def test_a_caller_may_ask_for_early_or_settled_verdicts(lift_gate: Path, tmp_pat
         wait_until(lambda: "\nlift after" in asked(lift_gate, *words).stdout)
 
 
-def test_the_outcome_of_a_lift_is_published(lift_gate: Path, tmp_path: Path) -> None:
+def test_a_lifts_outcome_is_published_once_and_contradictions_are_refused(
+    lift_gate: Path, tmp_path: Path
+) -> None:
     with (
         Daemon(tmp_path, whole_grasps=True) as daemon,
         Client(daemon.endpoint, ask_endpoint=daemon.ask_endpoint) as graspd,
@@ -124,13 +128,13 @@ def test_the_outcome_of_a_lift_is_published(lift_gate: Path, tmp_path: Path) -> 
     assert (told.boot_id, told.grasp) == (lifted_on.boot_id, lifted_on.grasp)
 
 
-def test_the_asking_program_reports_the_outcome(lift_gate: Path, tmp_path: Path) -> None:
+def test_lift_gate_reports_the_typed_outcome_of_its_lift(lift_gate: Path, tmp_path: Path) -> None:
     with Daemon(tmp_path, whole_grasps=True) as daemon:
         words = "--supervised", daemon.endpoint, 1.0, daemon.ask_endpoint, "mug"
         wait_until(lambda: asked(lift_gate, *words, typed="slipped").stdout.endswith("taken\n"))
 
 
-def test_a_killed_daemon_is_unknown_until_its_next_message(tmp_path: Path) -> None:
+def test_after_a_daemons_kill_verdicts_are_unknown_until_its_restart(tmp_path: Path) -> None:
     with Daemon(tmp_path) as daemon, Client(daemon.endpoint, max_age_ms=1e6) as graspd:
         wait_until(lambda: graspd.verdict(0.1).p_slip is not None)
         former = graspd.verdict().boot_id
@@ -182,7 +186,7 @@ def test_only_clients_with_keys_get_verdicts(lift_gate: Path, tmp_path: Path) ->
         Keys.load(public, own_public)
 
 
-def test_cpp_trusts_nothing_from_before_a_sleep(
+def test_the_cpp_client_forgets_messages_after_the_computer_slept(
     lift_gate: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     slept, endpoint = sleep_at_will(tmp_path, monkeypatch), f"ipc://{tmp_path}/out"
@@ -207,7 +211,7 @@ def test_cpp_trusts_nothing_from_before_a_sleep(
 @pytest.mark.parametrize(
     "words", [[], ["ipc:///x"], ["ipc:///x", "-1"], ["nowhere", "1"], ["--watch"]]
 )
-def test_a_wrong_command_line_never_means_yes(lift_gate: Path, words: list[str]) -> None:
+def test_lift_gate_exits_with_2_on_a_wrong_command_line(lift_gate: Path, words: list[str]) -> None:
     result = asked(lift_gate, *words)
     assert result.returncode == 2
     assert "lift_gate" in result.stdout + result.stderr

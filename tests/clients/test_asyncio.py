@@ -46,7 +46,7 @@ def test_a_lift_is_allowed_and_reported_once(tmp_path: Path) -> None:
         asyncio.run(lifts())
 
 
-def test_without_a_daemon_the_answer_comes_in_time(tmp_path: Path) -> None:
+def test_without_a_daemon_the_deadline_brings_a_no(tmp_path: Path) -> None:
     async def asks() -> None:
         async with made(tmp_path) as graspd:
             answer = await graspd.may_i_lift(DEADLINE_S)
@@ -79,7 +79,7 @@ def test_the_asyncio_client_waits_without_polling(
     assert len(looks) < 20, "a few for each call, and for what the clocks round off"
 
 
-def test_other_tasks_continue_while_it_waits(tmp_path: Path) -> None:
+def test_other_tasks_run_while_the_asyncio_client_waits(tmp_path: Path) -> None:
     async def waits() -> None:
         async with made(tmp_path, ask=False) as graspd:
             waiting = asyncio.create_task(graspd.wait_for_grasp(60.0))
@@ -91,7 +91,7 @@ def test_other_tasks_continue_while_it_waits(tmp_path: Path) -> None:
         asyncio.run(waits())
 
 
-def test_a_call_meanwhile_is_refused_and_a_cancelled_one_ends(tmp_path: Path) -> None:
+def test_an_overlapping_call_is_refused_and_a_cancelled_one_ends(tmp_path: Path) -> None:
     async def overlaps(heard: list[bytes]) -> None:
         async with made(tmp_path) as graspd:
             waiting = asyncio.create_task(graspd.may_i_lift(HOURS_S))

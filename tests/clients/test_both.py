@@ -1,4 +1,4 @@
-"""Both clients ask a daemon that answers what it should not: only what fits allows a lift."""
+"""Both clients ask a stand-in daemon with right and wrong answers: only right ones allow a lift."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from tests.clients.messages import TEACHES
 from tests.kit.waiting import wait_until
 
 LONG_S, DEADLINE_S = 100.0, 0.3
-"""For what is allowed in the end, and for what never is."""
+"""Deadlines of a lift that is allowed in the end, and of one that never is, s."""
 UNKNOWN, SLIP = {"outcome": "unknown"}, {"outcome": "slip"}
 WATCHED = UNKNOWN | TEACHES
-"""What is published in the warm-up."""
+"""Fields of a verdict published in the warm-up."""
 WATCHES, STILL = {"supervised": True}, {"still_ms": 240.0}
-"""What is asked for."""
+"""Arguments of `lift`: supervision by a person, stillness."""
 NO_RISK = {"target": 0.05, "lifts": 1, "slips": 0}
 Fields = dict[str, Any]
 Case = tuple[Fields, Answer | None, Fields, str]
-"""What is published besides `stable`, the answer (None: not asked), what is asked for, and
-what is said."""
+"""Changes to a published `stable`, the daemon's answer (None: not asked), arguments of `lift`, and
+the decision expected, or `supervised`."""
 
 ANSWERS: dict[str, Case] = {
     "the same": ({}, told(), {}, "stable"),
@@ -113,14 +113,14 @@ def test_a_refused_lift_has_its_reasons(
     wants: Fields,
     reasons: list[str],
 ) -> None:
-    """Asked until it does: on a busy machine a message may be old."""
+    """Asks until these reasons come, as on a busy machine a message may be too old first."""
     with false_daemon(tmp_path, **published):
         graspd = connect(tmp_path, ask)
         wait_until(lambda: graspd.lift(DEADLINE_S, **wants).reasons == tuple(reasons))
 
 
 @pytest.mark.parametrize("still_ms", [-1.0, float("nan"), float("inf")])
-def test_a_stillness_that_is_not_a_time_is_refused(
+def test_a_negative_or_not_finite_still_ms_is_refused(
     connect: Connect, tmp_path: Path, still_ms: float
 ) -> None:
     with pytest.raises(ValueError, match="still_ms"):
@@ -132,7 +132,7 @@ def test_a_stillness_that_is_not_a_time_is_refused(
     [(told(), "stable", True), (told(), "unknown", False), (told(grasp=2), "stable", False)],
     ids=["yes", "no", "of another grasp"],
 )
-def test_a_refusal_takes_back_the_lift_before(
+def test_a_client_that_says_no_sends_not_lifting(
     connect: Connect, tmp_path: Path, answer: Answer, outcome: str, may: bool
 ) -> None:
     with false_daemon(tmp_path, answer, outcome) as heard:
@@ -159,7 +159,7 @@ def test_a_refusal_takes_back_the_lift_before(
         (WATCHED | {"early": True}, True, None),
     ],
 )
-def test_only_a_grasp_that_is_surely_judged_is_returned(
+def test_wait_for_grasp_returns_only_a_grasp_judged_for_sure(
     connect: Connect, tmp_path: Path, published: Fields, watch: bool, found: int | None
 ) -> None:
     with false_daemon(tmp_path, **published):
@@ -167,7 +167,7 @@ def test_only_a_grasp_that_is_surely_judged_is_returned(
         assert connect(tmp_path).grasp(deadline_s, supervised=watch) == found
 
 
-def test_each_grasp_is_returned_once(connect: Connect, tmp_path: Path) -> None:
+def test_wait_for_grasp_returns_each_grasp_once(connect: Connect, tmp_path: Path) -> None:
     with false_daemon(tmp_path, messages_each=10):
         graspd = connect(tmp_path)
         grasps = [graspd.grasp(LONG_S) or 0 for _ in range(5)]

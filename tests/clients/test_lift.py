@@ -81,7 +81,7 @@ def test_a_closed_client_says_no_without_waiting() -> None:
     assert world.asking.said == []
 
 
-def test_an_unknown_answer_is_asked_for_again() -> None:
+def test_after_an_unknown_answer_the_client_asks_again() -> None:
     unknown, stable = (frames(verdict(0, START_NS, each))[1] for each in ("unknown", "stable"))
     world = World(stream(*["stable"] * 9), [(MS, unknown), (MS, stable)])
     with client(world, ask=True) as graspd:
@@ -96,7 +96,7 @@ def test_only_true_asks_for_supervised_lifts(not_true: object) -> None:
 
 
 def grasps(number: int) -> World:
-    """This number of grasps, each stable for 10 ms."""
+    """Make a world with this number of grasps, each stable for 10 ms, and answers to `lift`."""
     sent = coming(*(("stable", {"grasp": grasp}) for grasp in range(1, number + 1)))
     answers = [(0, message[1]) for _, message in sent for _ in range(2)]
     return World(sent, answers, [(MS, TAKEN)] * number)
@@ -113,7 +113,7 @@ def test_lifts_are_remembered_in_bounded_memory(monkeypatch: pytest.MonkeyPatch)
         assert len(graspd._lifts) == 4  # noqa: SLF001
 
 
-def test_an_outcome_waiting_for_the_disk_blocks_no_lift() -> None:
+def test_an_outcome_not_yet_acknowledged_blocks_no_lift() -> None:
     world = grasps(9)
     world.acknowledged[:] = [(1000 * MS, TAKEN)]
     with client(world, ask=True) as graspd:
@@ -156,7 +156,7 @@ def test_a_client_that_has_not_read_for_long_reconnects() -> None:
     assert world.renewed == 1
 
 
-def test_python_trusts_nothing_from_before_a_sleep() -> None:
+def test_the_python_client_forgets_messages_after_the_computer_slept() -> None:
     world = World(stream("stable", "stable", "stable"))
     with client(world) as graspd:
         assert graspd.verdict()
@@ -168,7 +168,7 @@ def test_python_trusts_nothing_from_before_a_sleep() -> None:
     assert world.renewed == 1
 
 
-def test_a_flood_of_messages_does_not_delay_the_client() -> None:
+def test_a_client_with_over_1000_waiting_messages_is_behind() -> None:
     world = World([(START_NS, [b"verdict.right"])] * 1500)
     with client(world) as graspd:
         assert graspd.verdict().reasons == ("behind",)
@@ -179,13 +179,16 @@ TOLD = b'{"v":1,"t_mono_ns":77000000000}'
 
 
 def heard() -> World:
-    """A daemon of which a message comes every 100 ms."""
+    """Make a world in which a message of the daemon comes every 100 ms for 12 s."""
     times = [START_NS + step * 100 * MS for step in range(120)]
     return World([(at_ns, frames(verdict(seq, at_ns))) for seq, at_ns in enumerate(times)])
 
 
 def asked_at_ms(world: World, *, same: bool = False) -> list[int]:
-    """Times of the questions, by looking every 100 ms for 12 s."""
+    """Call the client every 100 ms for 12 s; return when it asked for the daemon's clock, ms.
+
+    `same`: the daemon is on the same computer.
+    """
     times: list[int] = []
     with client(world, ask=True, same=same) as graspd:
         for step in range(120):
@@ -215,7 +218,7 @@ def test_a_client_beside_the_daemon_asks_no_clock() -> None:
     "answer",
     [b"", b"{}", b'{"v":2,"t_mono_ns":1}', b'{"v":1,"t_mono_ns":-1}', b'{"v":1,"ok":true}'],
 )
-def test_a_clock_that_is_not_understood_is_malformed(answer: bytes) -> None:
+def test_a_clock_answer_that_is_not_understood_counts_as_malformed(answer: bytes) -> None:
     world = World([])
     world.timing.answers.append((MS, answer))
     with client(world, ask=True, same=False) as graspd:

@@ -13,11 +13,11 @@ from tests.clients.building import CPP
 LITERALS = r""" "(?:\\.|[^"\\\n])*" | '(?:\\[^']+|[^'\\])' """
 HEADER = re.sub(LITERALS, '""', (CPP / "graspd_client.hpp").read_text(), flags=re.VERBOSE)
 HEADER = re.sub(r"//.*", "", HEADER)
-"""Without comments and strings."""
+"""The C++ header without comments and strings."""
 ONLY_PYTHON = {("Client", "close")}
-"""A destructor does that in C++."""
+"""Methods that C++ lacks: a destructor closes there."""
 FOR_ASYNCIO = "AsyncClient"
-"""Has what `Client` has; only Python has it."""
+"""Class that only Python has, with the same names as `Client`."""
 Names = dict[str, set[str]]
 
 
@@ -36,7 +36,7 @@ def in_python() -> Names:
 
 
 def body(kind: str) -> str:
-    """What stands between the braces of a type of the C++ header."""
+    """Return the text between the braces of a struct or class of the C++ header."""
     (start,) = re.finditer(rf"\b(?:struct|class) {kind}(?: final)?\b[^;{{]*{{", HEADER)
     depth = 1
     for place in range(start.end(), len(HEADER)):

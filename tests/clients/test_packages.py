@@ -1,4 +1,4 @@
-"""The C++ client is installed, and found by CMake and by pkg-config, by its README's own lines."""
+"""The README's lines install the C++ client, and build with it by CMake and by pkg-config."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PROGRAM = "lift_gate"
 
 
 def block(language: str, first: str) -> list[str]:
-    """Lines of the one code block in this language that begins so."""
+    """Return the lines of the README's one code block in `language` that begins with `first`."""
     (code,) = re.findall(rf"```{language}\n({first}.*?)```", README, re.DOTALL)
     return str(code).splitlines()
 
@@ -35,7 +35,7 @@ def run(*words: str | Path, **variables: str) -> str:
 
 @pytest.fixture(scope="module")
 def prefix(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where the client is installed."""
+    """Folder below which the C++ client is installed; skips the test if a tool is missing."""
     skip_unless_it_can_be_compiled()
     missing = [tool for tool in ("cmake", "pkg-config") if shutil.which(tool) is None]
     if missing:
@@ -50,13 +50,13 @@ def prefix(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def project(tmp_path: Path) -> Path:
-    """A program that has no header of the client beside it."""
+    """Folder with the source of a program, but without the client's header."""
     shutil.copy(CPP / f"{PROGRAM}.cpp", tmp_path)
     return tmp_path
 
 
 def works(program: Path, folder: Path) -> None:
-    """Where no daemon is, it may not lift, and says why."""
+    """Run the program without a daemon, and assert that it says no, and why."""
     result = asked(program, f"ipc://{folder}/nobody", 0.1)
     assert result.returncode == 1, result.stderr
     assert result.stdout.startswith("unknown [ no-message ]")
@@ -77,7 +77,7 @@ def test_pkg_config_finds_the_installed_client(prefix: Path, project: Path) -> N
 
 
 def test_the_readmes_program_lifts_nothing_without_an_answer(prefix: Path, project: Path) -> None:
-    """In both languages."""
+    """The README's programs in C++ and in Python, without a daemon."""
     said = {}
     endpoint = f"ipc://{project}/nobody"
     begins = {"python": "from graspd_client import Client, Outcome", "cpp": "#include <iostream>"}

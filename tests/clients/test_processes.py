@@ -59,7 +59,7 @@ with Client(out, ask_endpoint=ask) as graspd:
     assert graspd.may_i_lift(HOURS_S)
     assert graspd.counts.restarts == 0
 """
-"""A child that ends by itself, with all that its interpreter does at the end; then the parent."""
+"""Program whose forked child uses the parent's clients and its own and exits; then the parent."""
 
 
 def test_a_forked_process_gets_an_error_at_once(tmp_path: Path) -> None:
@@ -83,7 +83,7 @@ closed.close()
 del dropped, left, closed, loop, waiting
 gc.collect()
 """
-"""Two clients that nothing closes, and one whose loop no longer runs."""
+"""Program that drops two clients unclosed, and closes one after its event loop has ended."""
 
 
 def test_a_dropped_client_closes_its_sockets(tmp_path: Path) -> None:

@@ -1,9 +1,9 @@
 """What a rogue publisher or an older start sends allows no lift, in either language.
 
-A case is what comes after one another, each as a verdict in which all is well except its
-`change`, the field that it is `without`, or the time of its reading, `later_ms`. Its
-`frames` after the topic are that payload, changed as text (Latin-1: each character is a byte).
-Before it, the outcomes of the grasps were `told` of whose `boot_id` and number it has a list.
+The messages of a case `came` in this order. Each is a verdict in which all is well, except the
+fields in `change`, the field that it is `without`, or a reading `later_ms` after the others.
+`frames`: how to change this payload for each frame after the topic, as text (Latin-1: each
+character is a byte). `told`: `boot_id` and number of each grasp with an outcome told before.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from tests.clients.rules import START_NS, Rules
 CASES: list[dict[str, Any]] = json.loads(
     (Path(__file__).parent / "golden" / "refused.json").read_text()
 )
-"""What no client may lift on, one table for the tests of both languages."""
+"""Cases on which no client may lift, one table for the tests of both languages."""
 NOW_NS = START_NS + MS
-"""When a message is sent whose reading came at the start."""
+"""Time when messages arrive, ns: 1 ms after `START_NS`, when their reading was made."""
 
 
 def well(read_ns: int, seq: int = 0) -> dict[str, Any]:
-    """A message that a lift may rely on, of a reading at that time."""
+    """Return a message that permits a lift, of a reading at `read_ns`."""
     return verdict(seq, read_ns, **ADDED)
 
 
@@ -62,11 +62,11 @@ def _changed(payload: str, how: dict[str, Any]) -> bytes:
 PADDED = [TOPIC, json.dumps(well(START_NS)).encode().ljust(1 << 16)]
 """The longest message that is allowed."""
 Grasps = Sequence[tuple[str, int]]
-"""By `boot_id` and number."""
+"""Grasps, each by `boot_id` and number."""
 
 
 def told(cpp: Probe | None, messages: list[list[bytes]], ended: Grasps = ()) -> Verdict:
-    """What is said after these have come, with outcomes of these grasps told."""
+    """Return the verdict after these messages; outcomes of the grasps `ended` were told before."""
     rules = Rules(cpp)
     for grasp in ended:
         rules.end(*grasp)
@@ -87,14 +87,14 @@ def test_the_undamaged_message_allows_a_lift(cpp: Probe | None) -> None:
     assert told(cpp, [PADDED], [("a", 2), ("b", 1)]), "other grasps were told"
 
 
-def test_grasps_with_an_outcome_take_bounded_memory(cpp: Probe | None) -> None:
+def test_the_last_256_grasps_with_an_outcome_are_remembered(cpp: Probe | None) -> None:
     many = [("a", 1), *(("a", grasp) for grasp in range(2, 258))]
     assert told(cpp, [PADDED], many), "the 257th before"
     assert not told(cpp, [PADDED], many[:-1])
     assert not told(cpp, [PADDED], [*many, ("a", 1)])
 
 
-def test_a_client_needs_its_option_for_a_higher_threshold() -> None:
+def test_a_stable_with_p_slip_above_max_is_unknown() -> None:
     unsure = [TOPIC, json.dumps(well(START_NS) | {"p_slip": 0.6}).encode()]
     for most, reasons in ((0.5, ("p-slip",)), (0.7, ())):
         newest = Newest(TOPIC, MAX_AGE_NS, True, most)

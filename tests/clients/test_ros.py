@@ -1,4 +1,4 @@
-"""The examples for ROS, beside stand-ins for what they import of ROS: it is not there."""
+"""The examples for ROS, run with stand-ins for the ROS modules that they import."""
 
 from __future__ import annotations
 
@@ -44,18 +44,21 @@ class JointState(SimpleNamespace):
 
 
 ABSENT = Biotac(pac0=0, pac1=0, pdc=-9784, tac=32518, tdc=0, electrodes=array("h", [0] * 24))
-"""What shows for an absent sensor is this memory (Shadow's documentation)."""
+"""Values that the topic has for an absent sensor (Shadow's documentation)."""
 
 
 def header(number: int) -> SimpleNamespace:
-    """`std_msgs/Header`; its stamp is read in ROS 1 by `to_sec`, `seq` only there."""
+    """Make a `std_msgs/Header`, 10 ms per `number`; `to_sec` and `seq` exist only in ROS 1."""
     time_s = START_S + number / 100
     stamp = SimpleNamespace(sec=START_S, nanosec=number * 10_000_000, to_sec=lambda: time_s)
     return SimpleNamespace(seq=number, stamp=stamp)
 
 
 def sweep(number: int, *, repeats: int | None = None) -> BiotacAll:
-    """Counts of a hand with three sensors: 100 times the place of the sensor, and the number."""
+    """Make a message of a hand with three sensors, which read 1000 + 100 * place + `number`.
+
+    `repeats`: number of the message whose header it repeats.
+    """
     sensors = [ABSENT] * SENSORS
     for place in (0, 1, 4):
         counts = array("h", [1000 + 100 * place + number] * 24)
@@ -76,11 +79,12 @@ MESSAGES = (
     sweep(6),
     *(ARM, BOTH, WITHOUT_ANGLES),
 )
-"""The topic repeats its third message twice. Joints of an arm come on the topic of the hand's."""
+"""Messages in order: the header of the third sweep is repeated twice, and joints of an arm come on
+the topic of the hand's."""
 
 
 class Ros:
-    """The parts of `rospy` and of `rclpy` that the feeders use; spinning plays the messages."""
+    """The parts of `rospy` and of `rclpy` that the feeders use; `spin` plays `MESSAGES`."""
 
     def __init__(self, parameters: dict[str, object]) -> None:
         self._parameters = parameters
@@ -143,7 +147,7 @@ class Ros:
 
 
 def stand_in(monkeypatch: pytest.MonkeyPatch, modules: dict[str, dict[str, Any]]) -> None:
-    """Have these modules hold this for those that import them."""
+    """Replace modules for later imports; `modules`: names in each module by its name."""
     for name, holds in modules.items():
         module = ModuleType(name)
         vars(module).update(holds)
@@ -167,7 +171,9 @@ def free_ports() -> int:
 
 @pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning")
 @pytest.mark.parametrize("name", ["feed_ros1.py", "feed_ros2.py"])
-def test_a_feeder_sends_what_the_topics_have(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_ros_feeder_sends_its_topics_counts_and_angles(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert len((FOLDER / name).read_text().splitlines()) <= 40
     port = free_ports()
     stand_in(monkeypatch, Ros({"port": port}).modules())
@@ -235,7 +241,7 @@ class String(SimpleNamespace):
 
 
 class Service:
-    """A kind of service."""
+    """Stand-in for a service type of `std_srvs.srv`."""
 
     Request = Response = SimpleNamespace
 
@@ -259,7 +265,9 @@ def node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Node:
     return made
 
 
-def test_the_node_publishes_answers_and_tells(node: Node, tmp_path: Path) -> None:
+def test_the_ros2_node_publishes_decisions_answers_and_reports_outcomes(
+    node: Node, tmp_path: Path
+) -> None:
     decisions = node.published["~/decision"]
     ((period_s, publish),) = node.timers.items()
     assert period_s * 1e3 < 100, "in less than the age limit"
@@ -278,7 +286,7 @@ def test_the_node_publishes_answers_and_tells(node: Node, tmp_path: Path) -> Non
     node.graspd.close()  # type: ignore[attr-defined]
 
 
-def test_the_node_says_why_it_refuses(node: Node, tmp_path: Path) -> None:
+def test_the_ros2_node_says_why_it_refuses(node: Node, tmp_path: Path) -> None:
     with false_daemon(tmp_path, outcome="unknown", reasons=["moving"]):
         wait_until(lambda: node.ask("~/may_i_lift") == (False, "unknown moving"))
         assert node.ask("~/held", data=True) == (False, "no lift was allowed")

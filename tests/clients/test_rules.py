@@ -66,13 +66,13 @@ def test_both_clients_judge_random_messages_alike(
 
 
 def said(cpp: Probe | None, message: dict[str, Any]) -> Verdict:
-    """What is known at once of a message."""
+    """Return the verdict right after this message, the only one."""
     rules = Rules(cpp)
     rules.take(frames(message))
     return rules.at()
 
 
-def test_a_verdict_has_risk_motion_and_finger_words(cpp: Probe | None) -> None:
+def test_a_verdict_has_risk_motion_and_finger_states(cpp: Probe | None) -> None:
     found = said(cpp, verdict(0, START_NS, **ADDED))
     assert found
     assert (found.p_slip, found.p_slip_model, found.outcomes) == (0.125, 0.3, 57)
@@ -85,7 +85,7 @@ def test_a_verdict_has_risk_motion_and_finger_words(cpp: Probe | None) -> None:
 
 
 @pytest.mark.parametrize("path", sorted(GOLDEN.glob("verdict_*.json")), ids=lambda path: path.stem)
-def test_golden_verdicts_are_understood_with_and_without_what_was_added(
+def test_golden_verdicts_are_understood_with_and_without_added_fields(
     cpp: Probe | None, path: Path
 ) -> None:
     golden = json.loads(path.read_text())
@@ -99,7 +99,7 @@ def test_golden_verdicts_are_understood_with_and_without_what_was_added(
         assert (seen.decision, seen.reasons) == (message["verdict"], tuple(message["reasons"]))
 
 
-def test_a_lift_under_supervision_is_not_stable(cpp: Probe | None) -> None:
+def test_a_supervised_verdict_counts_as_false_even_if_stable(cpp: Probe | None) -> None:
     found = said(cpp, supervised(0, START_NS))
     assert (bool(found), found.supervised, found.reasons) == (False, True, ("unproven",))
     assert not said(cpp, verdict(0, START_NS, supervised=True))
@@ -109,7 +109,7 @@ def test_a_lift_under_supervision_is_not_stable(cpp: Probe | None) -> None:
 @pytest.mark.parametrize(
     ("later_ms", "reasons"), [(99, ()), (100, ("stale",)), (101, ("silent",)), (-2, ("clock",))]
 )
-def test_a_message_that_gets_old_says_why(
+def test_a_message_too_old_or_in_the_future_says_why(
     cpp: Probe | None, later_ms: int, reasons: tuple[str, ...]
 ) -> None:
     rules = Rules(cpp)  # read at 1 s, published 1 ms later
@@ -155,7 +155,7 @@ def test_another_computers_delayed_messages_are_never_stable(
         empty_ns = arrived_ns
 
 
-def test_another_computers_first_message_may_be_old(cpp: Probe | None) -> None:
+def test_another_computers_first_message_is_unknown_with_reason_joining(cpp: Probe | None) -> None:
     rules = Rules(cpp, False)
     rules.take(frames(verdict(7, OFFSET_NS)))
     assert rules.at().reasons == ("joining",)
@@ -163,7 +163,7 @@ def test_another_computers_first_message_may_be_old(cpp: Probe | None) -> None:
     assert rules.at(START_NS + 10 * MS)
 
 
-def test_messages_of_a_rebooted_computer_count_again(cpp: Probe | None) -> None:
+def test_after_the_daemons_computer_reboots_its_second_message_counts(cpp: Probe | None) -> None:
     rules = Rules(cpp, False)
     for number, boot_id in enumerate("aabb"):
         now_ns = START_NS + number * 10 * MS
@@ -174,10 +174,10 @@ def test_messages_of_a_rebooted_computer_count_again(cpp: Probe | None) -> None:
 
 @many
 @given(st.lists(st.tuples(st.integers(0, 300), st.integers(0, 300)), max_size=40), DRIFTS)
-def test_with_the_daemons_clock_no_delay_is_hidden(
+def test_with_clock_comparisons_no_message_delayed_too_long_is_stable(
     cpp: Probe | None, delays_ms: list[tuple[int, int]], drift: float
 ) -> None:
-    """The delay of each message, and of each question before it, from the first message on."""
+    """`delays_ms`: of each message after the first, and of the clock's question before it."""
     rules = Rules(cpp, False)
     for seq, (delay_ms, asking_ms) in enumerate([(1, 1), *delays_ms]):
         sent_ns = START_NS + seq * 1000 * MS
@@ -215,10 +215,10 @@ def test_without_a_clock_comparison_little_drift_is_allowed(cpp: Probe | None) -
 
 @pytest.mark.parametrize("first", ["clock", "message"])
 @pytest.mark.parametrize("between_ms", [50, 150, 700])
-def test_with_a_known_clock_reading_rarely_ages_no_message(
+def test_with_a_known_clock_rare_reading_makes_no_message_old(
     cpp: Probe | None, first: str, between_ms: int
 ) -> None:
-    """Messages wait to be read: the queue was last empty at the look before."""
+    """Each message may have waited since the look before, when the queue was empty."""
     rules = Rules(cpp, False)
     now_ns, ahead_ns = START_NS, START_NS - OFFSET_NS
     if first == "message":
@@ -245,7 +245,7 @@ def test_after_forgetting_only_a_newer_message_counts() -> None:
     assert newest.at(START_NS).reasons == ("joining",)  # how the clocks differ is not known now
 
 
-def test_messages_that_waited_unread_are_silence(cpp: Probe | None) -> None:
+def test_messages_that_waited_unread_too_long_count_as_silence(cpp: Probe | None) -> None:
     rules = Rules(cpp, False)
     now_ns = START_NS + 3000 * MS
     for seq in range(50):  # came in the first half second, read after three

@@ -1,4 +1,4 @@
-"""Watching over a lift: it is stopped for what slides, and for what is not known."""
+"""`wait_for_slide` stops a lift if a finger slides, lets go, or its state is not known."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ HELD: Words = {"ff": "touch", "th": "touch"}
 
 
 def lift(*words: Words | None, **more: object) -> list[tuple[int, list[bytes]]]:
-    """Messages, one every 10 ms, in which the fingers feel this; None: not told."""
+    """Make messages, one every 10 ms, each with these states of the fingers; None: without."""
     told = ({} if felt is None else {"fingers": felt} for felt in words)
     return coming(*(("unknown", each | more) for each in told))
 
@@ -39,7 +39,7 @@ def test_a_slide_stops_the_lift_at_once() -> None:
 
 
 def waiting(sent: list[tuple[int, list[bytes]]]) -> list[tuple[int, list[bytes]]]:
-    """The same, but from the sixth on four messages wait for one look."""
+    """Return the messages, but the sixth to ninth arrive together, for one look of the client."""
     late_ns = sent[8][0]
     return sent[:5] + [(max(at_ns, late_ns), message) for at_ns, message in sent[5:]]
 
@@ -68,11 +68,11 @@ ENDS: dict[str, tuple[list[tuple[int, list[bytes]]], int, tuple[str, ...]]] = {
         (),
     ),
 }
-"""What comes in a lift of 300 ms, after how many it ends, and what slides."""
+"""Messages in a lift of 300 ms, when the watch ends, ms, and the fingers that slide."""
 
 
 @pytest.mark.parametrize(("sent", "after_ms", "sliding"), ENDS.values(), ids=ENDS)
-def test_a_slide_or_missing_finger_words_stop_the_lift(
+def test_slide_release_or_unknown_finger_states_stop_a_lift(
     sent: list[tuple[int, list[bytes]]], after_ms: int, sliding: tuple[str, ...]
 ) -> None:
     answer = watched(sent)
@@ -81,7 +81,7 @@ def test_a_slide_or_missing_finger_words_stop_the_lift(
     assert answer.waited_s == pytest.approx(after_ms / 1e3, abs=0.012)
 
 
-def test_an_old_verdict_has_no_finger_words() -> None:
+def test_an_old_readings_finger_states_are_unknown() -> None:
     with client(World(lift(HELD, age_ms=101.0))) as graspd:
         assert graspd.verdict().fingers == {"ff": None, "th": None}
     with client(World(lift(HELD, age_ms=90.0))) as graspd:
@@ -109,7 +109,10 @@ def test_in_cpp_a_lift_is_stopped_for_the_same_reasons(
     passes: bool,
     answer: str,
 ) -> None:
-    """`passes`: the fingers hold again before the client looks."""
+    """The fingers become `later` during a lift; `passes`: and hold again before the client looks.
+
+    `answer`: the probe's, True if the lift must be stopped, and if it was held.
+    """
     fingers = dict(HELD)
     with (
         false_daemon(tmp_path, outcome="unknown", fingers=fingers),
@@ -117,12 +120,12 @@ def test_in_cpp_a_lift_is_stopped_for_the_same_reasons(
     ):
 
         def become(felt: Words) -> None:
-            """Returns once a message has said so."""
+            """Change the fingers' states, and wait until a message has them."""
             fingers.update(felt)
             wait_until(lambda: other.verdict(0.1).fingers == fingers)
 
         def is_answered() -> bool:
-            """On a machine that stands still the probe may begin to look too late for it."""
+            """True if the probe gave the answer; on a busy machine it may begin too late."""
             fingers.update(HELD)
             wait_until(lambda: probe.ask("slide", 0.01) == "0 1")  # it has received them
             probe.tell("slide", timeout_s)

@@ -1,4 +1,4 @@
-"""Both clients tell how a lift ended to a daemon that answers what it should not."""
+"""Both clients report how a lift ended, to a stand-in daemon with right and wrong answers."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_a_malformed_object_name_is_not_sent(connect: Connect, tmp_path: Path, n
         assert heard == []
 
 
-def test_an_outcome_needs_a_grasp_an_endpoint_and_a_client(tmp_path: Path) -> None:
+def test_an_outcome_needs_grasp_ask_endpoint_and_open_client(tmp_path: Path) -> None:
     lifted_on = Verdict(Decision.STABLE, grasp=42, boot_id="a" * 32)
     asking = Client(f"ipc://{tmp_path}/out", ask_endpoint=f"ipc://{tmp_path}/ask")
     with asking as graspd, pytest.raises(ValueError, match="of no grasp"):
@@ -77,7 +77,7 @@ def test_a_grasp_with_an_outcome_is_not_offered_again(connect: Connect, tmp_path
         assert graspd.grasp(DEADLINE_S) is None
 
 
-def test_a_yes_that_no_lift_follows_is_offered_again(connect: Connect, tmp_path: Path) -> None:
+def test_a_grasp_reported_as_not_lifted_is_offered_again(connect: Connect, tmp_path: Path) -> None:
     with false_daemon(tmp_path) as heard:
         graspd = connect(tmp_path)
         assert graspd.tell(graspd.lift(LONG_S).grasp, "not-lifted") == ""
@@ -86,7 +86,9 @@ def test_a_yes_that_no_lift_follows_is_offered_again(connect: Connect, tmp_path:
         assert graspd.unreported == 0
 
 
-def test_an_outcome_not_kept_stays_unreported(connect: Connect, tmp_path: Path) -> None:
+def test_an_outcome_that_graspd_cannot_keep_stays_unreported(
+    connect: Connect, tmp_path: Path
+) -> None:
     not_kept = b'{"v":1,"ok":false,"why":"not kept: No space left on device"}'
     with false_daemon(tmp_path, taken=[not_kept], messages_each=10):
         graspd = connect(tmp_path)

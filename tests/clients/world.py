@@ -17,12 +17,12 @@ from tests.clients.messages import MS, frames, verdict
 START_NS = 1000 * MS
 ASK = "ipc:///nowhere.ask"
 LOOK_NS = 1000
-"""What each look at the clock takes."""
+"""Time that each look at the clock takes, ns."""
 
 
 @dataclass
 class Call:
-    """What is asked or told, and the answers to it."""
+    """Stand-in for a client's `_Call`: questions `said`, and `answers` with their delays, ns."""
 
     world: World
     answers: list[tuple[int, bytes]]
@@ -50,17 +50,17 @@ class Call:
 
 @dataclass
 class World:
-    """A clock, and sockets where things come in time."""
+    """Stand-in for a client's `_Link` and clocks: sockets on which messages arrive at set times."""
 
     coming: list[tuple[int, list[bytes]]]
-    """When what comes, ns."""
+    """Messages to come: time of arrival, ns, and frames."""
     answers: list[tuple[int, bytes]] = field(default_factory=list)
-    """How long after its question each comes, ns; then none any more."""
+    """Answers to `lift` in order: delay after the question, ns, and payload; then no more."""
     acknowledged: list[tuple[int, bytes]] = field(default_factory=list)
-    """The same of outcomes."""
+    """Answers to outcomes: delay after the report, ns, and payload."""
     now_ns: int = START_NS
     slept_ns: int = 0
-    """What the computer has slept: the monotonic clock does not count it."""
+    """Time for which the computer has slept; the monotonic clock does not count it."""
     came: list[list[bytes]] = field(default_factory=list)
     renewed: int = 0
 
@@ -95,7 +95,7 @@ class World:
 
 @contextmanager
 def client(world: World, ask: bool = False, same: bool | None = None) -> Iterator[Client]:
-    """A client in that world."""
+    """Make a client on the world's sockets and clocks. `same`: as `same_computer`."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(graspd_client, "_Link", lambda *_: world)
         clocks = {"monotonic_ns": world.monotonic_ns, "clock_gettime_ns": world.boot_ns}
@@ -106,7 +106,7 @@ def client(world: World, ask: bool = False, same: bool | None = None) -> Iterato
 
 
 def coming(*messages: tuple[str, Mapping[str, Any]]) -> list[tuple[int, list[bytes]]]:
-    """One message every 10 ms from now on, each by its verdict and what else differs."""
+    """Make messages, one every 10 ms from `START_NS` on, each of a verdict and changed fields."""
     sent = []
     for seq, (outcome, more) in enumerate(messages):
         at_ns = START_NS + seq * 10 * MS
