@@ -28,11 +28,11 @@ from graspd.drivers.recordings.csv_player import DEMO_RECORDING
 from graspd.drivers.twins.grasps.grasps import recorded_counts
 
 READINGS = 1000
-"""Readings of each kind that are counted: start-up differs by as much as 20 of them cost."""
+"""Readings of each kind that are counted: many, as start-up's cost varies by that of 20."""
 IDLE, HELD = slice(100, 150), slice(255, 285)
-"""Sweeps of the demo in which nothing touches, and in which its first grasp is judged."""
+"""Rows of the demo in which nothing touches, and in which its first grasp is judged."""
 NOISE_COUNTS = 3.0
-"""Standard deviation of a sensor's noise: without any, readings would repeat."""
+"""Standard deviation of the noise added to counts: without any, readings would repeat."""
 PERIOD_NS = 10_000_000
 CACHE_BYTES = 1 << 21
 """Size of the simulated cache whose misses count: larger than what a reading touches."""
@@ -45,7 +45,10 @@ sensors = ["ff", "mf", "th"]
 
 
 def judge(kind: str) -> None:
-    """Judge the demo's first grasp, and readings of one kind besides; runs within cachegrind."""
+    """Judge the demo's first grasp, and `READINGS` more of a kind: `idle`, `judged`, else none.
+
+    Runs within cachegrind.
+    """
     now_ns = 0
     scene = Scene.model_validate(tomllib.loads(SCENE))
     pipeline = assembly.build_pipeline(Plan.of(scene), assembly.load_model(scene), lambda: now_ns)
@@ -75,7 +78,7 @@ def judge(kind: str) -> None:
 
 
 def count(kind: str) -> dict[str, int]:
-    """Return what cachegrind counts of `judge`, by the names of its events."""
+    """Run `judge(kind)` in cachegrind, and return its counts by the names of its events."""
     with TemporaryDirectory() as folder:
         path = Path(folder, "counts")
         options = "--cache-sim=yes", f"--LL={CACHE_BYTES},16,64", f"--cachegrind-out-file={path}"

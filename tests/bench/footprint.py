@@ -29,7 +29,7 @@ EXAMPLES = Path(__file__).parents[2] / "deploy" / "scenes"
 READINGS = 300
 """Readings that are timed: three grasps."""
 ASK_EVERY = 20
-"""Readings between two questions, where a grasp is judged on request only."""
+"""Readings between two questions, if the scene judges a grasp on request only."""
 SILENCE_NS = 100_000_000
 MIB = 1024
 TIMEOUT_S = 120.0
@@ -42,13 +42,13 @@ TITLES = (
 )
 
 Footprint = dict[str, Any]
-"""`modules`: names of all; `rss_kib`, `own_kib` (Python's own), `threads`, `descriptors`, `cpu_ms`:
-from the start of the process to the first reading judged and reported; `reading`, `judged`: CPU
-times, us, of readings and of those that the network judged, sorted."""
+"""`modules`: names of all loaded; `rss_kib`, `own_kib` (Python's own), `threads`, `descriptors`,
+`cpu_ms`: once the first reading is judged and reported; `reading`, `judged`: CPU times, us, of all
+readings and of those that the model judged, sorted."""
 
 
 def measure(scene: Path) -> Footprint:
-    """Measure a scene in a process of its own, for about a second."""
+    """Measure a scene in a process of its own, for about a second. Raises `RuntimeError`."""
     with tempfile.TemporaryDirectory(prefix="graspd-") as folder:
         result = subprocess.run(
             [sys.executable, "-m", "tests.bench.footprint", "--here", scene.absolute(), folder],
@@ -114,7 +114,7 @@ def here(path: Path, folder: Path) -> Footprint:
 
 
 def _apart(wanted: Scene, folder: Path) -> Scene:
-    """Return the scene with its sockets and session in `folder`, playing recordings at once."""
+    """Return the scene with its sockets and session in `folder`, and fast replay of recordings."""
     from graspd.daemon.scene.drivers import ReplayTactile
     from graspd.daemon.scene.scene import Ask
 
@@ -130,7 +130,7 @@ def _apart(wanted: Scene, folder: Path) -> Scene:
 
 
 def _around(parts: Parts, stack: ExitStack) -> Outbox:
-    """Build what `graspd run` puts around the judge."""
+    """Build session, sockets and loop around the judge, as `graspd run` does; return the outbox."""
     from graspd.daemon.assembly.parts import Assembly
     from graspd.daemon.process.signals import StopSignal
     from graspd.daemon.run.loop import Loop, LoopTiming
@@ -169,7 +169,10 @@ def _readings(parts: Parts) -> Iterator[Reading]:
 
 
 def _judge(reading: Reading, parts: Parts, outbox: Outbox) -> tuple[float, bool] | None:
-    """Return us of CPU, and True if the network judged; None for joint angles."""
+    """Judge and report a reading; return the CPU time of judging, us, and if the model was run.
+
+    None for joint angles, which are only taken in.
+    """
     from graspd.drivers.base import JointReading
 
     if isinstance(reading, JointReading):
@@ -198,7 +201,7 @@ def _timed(readings: Iterator[Reading], parts: Parts, outbox: Outbox) -> Footpri
 
 
 def _status(key: str) -> int:
-    """Return a number of /proc/self/status (proc(5)); memory is in KiB."""
+    """Return the number of a key in /proc/self/status (proc(5)); memory is in KiB."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith(f"{key}:"))
 

@@ -1,4 +1,4 @@
-"""How the gate and its fingers' words follow generated hands: the figures of deploy/JUDGING.md.
+"""How gate and finger states follow generated hands: the figures of deploy/JUDGING.md.
 
 `python -m tests.bench.gate [EPISODES]` prints a row for sweeps as a palm holds them, at 71.43 Hz,
 and one for fresh sweeps at 100 Hz. Each figure comes from EPISODES hands: they hold, or the object
@@ -30,11 +30,11 @@ REST_S, CLOSES_S, HOLDS_S = 1.5, 0.25, 3.0
 CLOSED = round(100 * (REST_S + CLOSES_S))
 """The first sweep of a closed hand."""
 SLIDE_AFTER_S = (1.0, 1.3)
-"""When a slide begins that a held hand does not expect, s after the hand has closed."""
+"""Range of the time from the hand's closing to the begin of a later slide, s."""
 REST_COUNTS, PRESSED_COUNTS = 2500.0, 600.0
-"""Where its electrodes rest, and by how much the most pressed one falls, counts."""
+"""Counts of an electrode at rest, and most by which a closed hand lowers them."""
 NONE, ONE, THREE = (False,) * 3, (True, False, False), (True,) * 3
-"""Along which fingers the object slides."""
+"""True for each finger along which the object slides."""
 HEAD = (
     "sweeps",
     "a hand holds: the verdict stands",
@@ -48,14 +48,14 @@ HEAD = (
 
 
 class Closing:
-    """A hand that closes at `REST_S`, and then holds as `hold` does."""
+    """Counts of a hand that closes at `REST_S`, added to the motion of `hold`."""
 
     def __init__(self, hold: Hold, rng: np.random.Generator) -> None:
         self._hold = hold
         self._pressed = rng.uniform(0.0, PRESSED_COUNTS, (len(FINGERS), ELECTRODES))
 
     def deviation(self, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Counts less the rest, shape (fingers, 24)."""
+        """Counts less the rest, shape (fingers, 24), as sampled at `t_s`, shape () or (24,)."""
         share = np.clip((t_s - REST_S) / CLOSES_S, 0.0, 1.0)
         ramp = share**3 * (10.0 + share * (6.0 * share - 15.0))  # minimum jerk
         return self._hold.deviation(t_s) - ramp * self._pressed
@@ -63,30 +63,31 @@ class Closing:
 
 @dataclass(frozen=True, slots=True)
 class Felt:
-    """What is said of one hand, sweep by sweep since it has closed."""
+    """What the gate says of one hand, sweep by sweep after it has closed."""
 
     stands: NDArray[np.bool_]
-    """True where a verdict stands."""
+    """True where the gate lets a verdict stand, shape (sweeps,)."""
     slides: NDArray[np.bool_]
-    """True where a finger says `slide`, shape (sweeps, fingers)."""
+    """True where a finger's state is `slide`, shape (sweeps, fingers)."""
     slides_at: int
-    """The sweep from which a slide that begins can be detected."""
+    """Sweep at which a later slide begins, counted from closing."""
 
     @property
     def stood(self) -> int:
-        """The first sweep at which a verdict stood; where none did, the last."""
+        """First sweep at which a verdict stood; the last sweep if none ever did."""
         return int(self.stands.argmax()) if self.stands.any() else len(self.stands) - 1
 
     @property
     def revoked_ms(self) -> float | None:
-        """How long a verdict stood after the slide began, ms; None: it did not stand then."""
+        """Time from the slide's begin to the verdict's end, ms; None: no verdict stood then."""
         stands = self.stands[self.slides_at :]
         if not self.stands[self.slides_at - 1]:
             return None
         return 10.0 * (len(stands) if stands.all() else int(stands.argmin()))
 
     def named_ms(self, *fingers: int) -> float:
-        """After which time one of these fingers says `slide`, ms; infinite where none does."""
+        """Return the time from the slide's begin to `slide` of one of these fingers, ms; infinite
+        if none has it."""
         says = self.slides[self.slides_at :, fingers].any(axis=1)
         return 10.0 * int(says.argmax()) if says.any() else math.inf
 
@@ -99,7 +100,11 @@ def feel(
     begins: bool = False,
     slide_spread: float = SLIDE_SPREAD,
 ) -> Felt:
-    """Play a hand to the gate. The object slides from the start, or when a slide `begins`."""
+    """Play a generated hand to the gate, and return what that says.
+
+    The object slides along the fingers in `sliding` from the start, or from a drawn time after
+    closing if `begins`. `held`: sweeps as a palm holds them.
+    """
     rng = np.random.default_rng([seed, 4])
     closed_s = REST_S + CLOSES_S
     slide_s = closed_s + rng.uniform(*SLIDE_AFTER_S)
@@ -120,7 +125,7 @@ def feel(
 
 
 def cells(episodes: int, *, held: bool) -> list[str]:
-    """Return the row of the table."""
+    """Return a row of the table; `held`: for sweeps as a palm holds them."""
     seeds = range(episodes)
     holds = [feel(seed, NONE, held=held) for seed in seeds]
     slides = [feel(seed, THREE, held=held) for seed in seeds]
@@ -147,7 +152,7 @@ def percent(says: NDArray[np.bool_]) -> str:
 
 
 def times(found_ms: list[float]) -> str:
-    """Return the median of times, and what nine in ten stay below."""
+    """Return the median and the 90 % quantile of times as text."""
     return f"{np.median(found_ms):.0f} / {np.quantile(found_ms, 0.9):.0f} ms"
 
 

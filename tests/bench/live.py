@@ -24,23 +24,23 @@ from tests.daemon.processes import GRASPD, graspd_with
 from tests.kit.messages import decode_verdict
 
 PATIENCE_S = 100.0
-"""Longest wait for what must come, s."""
+"""Longest wait for a message or verdict that must come, s."""
 STOP_S = 5.0
 """Longest wait for a process that was told to stop, s."""
 SEED = 1
-"""A synthetic grasp that `cnn1` judges."""
+"""Seed of a synthetic grasp that `cnn1` judges."""
 HELD = Durations(first_rest_s=(1.5, 1.5), settle_s=(600.0, 600.0))
-"""A grasp that is closed once and then held."""
+"""Durations of a grasp that closes once and is then held."""
 
 
 def held_grasp() -> Iterator[Counts]:
-    """Counts of a grasp that is held for ten minutes."""
+    """Return the counts of a synthetic grasp that is held for ten minutes, sweep by sweep."""
     moments = synthetic_grasps(1, rate_hz=RATE_HZ, durations=HELD, seed=SEED)
     return (moment.counts for moment in moments)
 
 
 def spi_section(folder: Path) -> str:
-    """The scene's section for an SPI twin at `bridge` in a folder."""
+    """Return the scene's `[tactile]` section for an SPI twin at `bridge` in a folder."""
     return f'[tactile]\ndriver = "spi"\nport = "{folder}/bridge"\n'
 
 
@@ -53,7 +53,7 @@ class Child(subprocess.Popen[bytes]):
 
 
 class Subscriber:
-    """Hears a daemon."""
+    """Subscribes to a daemon's messages, without losing any itself."""
 
     def __init__(
         self,
@@ -62,7 +62,8 @@ class Subscriber:
         topics: Sequence[str] = ("verdict.",),
         keys: Path | None = None,
     ) -> None:
-        """`keys`: folder of a daemon's key and of a friend's; None: without keys."""
+        """`topics`: beginnings of topics. `keys`: folder with `daemon.key_secret` and
+        `clients/friend.key_secret`; None: without keys."""
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._socket = self._context.socket(zmq.SUB)
         self._socket.rcvhwm = 0  # what is lost must be lost elsewhere
@@ -84,7 +85,7 @@ class Subscriber:
         self._context.term()
 
     def take(self, timeout_s: float) -> tuple[bytes, bytes] | None:
-        """Topic and payload of the next message; None if none comes in time."""
+        """Return topic and payload of the next message; None if none comes in time."""
         if not self._socket.poll(max(round(timeout_s * 1e3), 0)):
             return None
         topic, payload = self._socket.recv_multipart()
@@ -92,7 +93,7 @@ class Subscriber:
         return topic, payload
 
     def drain(self) -> None:
-        """Drop what has come already."""
+        """Drop all messages that have come already."""
         while self.take(0.0) is not None:
             pass
 
@@ -102,7 +103,7 @@ class Subscriber:
         return None if message is None else decode_verdict(message[1])
 
     def wait_for(self, wanted: Callable[[Verdict], bool]) -> Verdict:
-        """Return the first verdict like that. Raises `TimeoutError`."""
+        """Return the first verdict for which `wanted` is True. Raises `TimeoutError`."""
         deadline_s = time.monotonic() + PATIENCE_S
         while (verdict := self.verdict(deadline_s - time.monotonic())) is not None:
             if wanted(verdict):
@@ -124,8 +125,8 @@ def running(
     """Run a daemon on `scene.toml` in `folder`, and subscribe to it; its log is `log` there.
 
     The scene has `sections`, and a last one `[publish]` with the lines of `publish`. The `endpoint`
-    is `v` in `folder` unless given. `high_water_mark`: most messages that wait for a subscriber, if
-    it is not the daemon's own. `keys` as of `Subscriber`.
+    is `v` in `folder` unless given. `high_water_mark`: most messages that wait for a subscriber;
+    None: the daemon's own limit. `keys`: see `Subscriber`.
     """
     endpoint = endpoint or f"ipc://{folder}/v"
     scene = folder / "scene.toml"
@@ -145,18 +146,18 @@ def running(
 
 @dataclass(frozen=True, slots=True)
 class Usage:
-    """What a process holds."""
+    """Memory, descriptors and threads of a process at a time."""
 
     t_s: float
-    """When, monotonic s."""
+    """Time of the measurement, monotonic s."""
     rss_kib: int
-    """Its memory, and what it has together with others."""
+    """Resident memory, including what is shared with other processes."""
     descriptors: int
     threads: int
 
 
 def usage(pid: int) -> Usage:
-    """Return what a running process uses (proc(5): smaps_rollup)."""
+    """Return the usage of a running process (proc(5): smaps_rollup)."""
     about = Path(f"/proc/{pid}")
     memory = (about / "smaps_rollup").read_text().partition("\nRss:")[2]
     return Usage(
@@ -168,17 +169,17 @@ def usage(pid: int) -> Usage:
 
 
 def memory_mib(pid: int) -> float:
-    """Memory of a process now, MiB, from which `peak_mib` starts."""
+    """Reset the peak of a process that `peak_mib` returns; return its resident memory now, MiB."""
     Path(f"/proc/{pid}/clear_refs").write_text("5")
     return peak_mib(pid)
 
 
 def peak_mib(pid: int) -> float:
-    """Most memory of a process since `memory_mib`, MiB; 0 of one that has ended."""
+    """Return the most resident memory of a process since `memory_mib`, MiB; 0 after its end."""
     status = Path(f"/proc/{pid}/status").read_text()
     return int((status.partition("VmHWM:")[2].split() or ["0"])[0]) / 1024
 
 
 def end_children_at_sigterm() -> None:
-    """Have SIGTERM end the blocks of this process, and so the processes that it started."""
+    """Have SIGTERM exit this process through its `with` blocks, which end its children."""
     signal.signal(signal.SIGTERM, lambda number, _frame: sys.exit(128 + number))

@@ -1,4 +1,4 @@
-"""Mutants: modules with one small mistake each, made from their text."""
+"""Mutants: modules with one small mistake each, made from their source text."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from types import CodeType
 from typing import Final
 
 BY_ONE_MAX, BY_ONE_MAX_FLOAT = 1_000_000, 100.0
-"""Numbers up to these differ by one, others by `SHARE`."""
+"""Largest int and float that a mistake changes by one; larger ones change by `SHARE`."""
 SHARE = 0.2
 
 COMPARISONS: Final[dict[type[ast.cmpop], tuple[type[ast.cmpop], ...]]] = {
@@ -40,7 +40,7 @@ OPERATORS: Final[dict[type[ast.operator], type[ast.operator]]] = {
 }
 
 Change = Callable[[ast.AST], None]
-"""Makes the mistake in a node."""
+"""Makes the mistake in a node of the syntax tree, in place."""
 
 
 @dataclass(frozen=True)
@@ -49,17 +49,17 @@ class Mutant:
 
     source: str
     place: int
-    """Place of the changed node among those of the module."""
+    """Number of the changed node in the order of `_nodes`."""
     line: int
     begin: int
-    """First line of the statement around it: what runs them runs the mistake."""
+    """First line of the statement around `line`: a test that runs any of these lines runs it."""
     what: str
     change: Change
     file: str
-    """From the root."""
+    """Path of the module from the root of the tree."""
 
     def code(self) -> CodeType:
-        """The module with the mistake, compiled."""
+        """Return the module with the mistake, compiled."""
         tree = ast.parse(self.source)
         for place, (node, _) in enumerate(_nodes(tree, None)):
             if place == self.place:
@@ -73,7 +73,7 @@ class Mutant:
 
 
 def mutants(source: str, file: str) -> Iterator[Mutant]:
-    """All mutants of a module."""
+    """Yield all mutants of a module; `file`: its path from the root."""
     for place, (node, statement) in enumerate(_nodes(ast.parse(source), None)):
         line = getattr(node, "lineno", 0)
         for what, change in _changes(node):
@@ -83,7 +83,10 @@ def mutants(source: str, file: str) -> Iterator[Mutant]:
 def _nodes(
     parent: ast.AST, statement: ast.stmt | None
 ) -> Iterator[tuple[ast.expr | ast.stmt, ast.stmt]]:
-    """What may be changed, and the statement around it: no annotations, no messages."""
+    """Yield each node below `parent` that may be changed, and the statement around it.
+
+    Leaves out annotations, decorators and messages.
+    """
     for name, value in ast.iter_fields(parent):
         if name in ("annotation", "returns", "decorator_list"):
             continue
@@ -97,7 +100,7 @@ def _nodes(
 
 
 def _is_message(node: ast.AST) -> bool:
-    """Text for people: formatted strings and the log."""
+    """Return True for text for people: formatted strings and calls of the log."""
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
         node = node.func.value
         return isinstance(node, ast.Name) and node.id == "_log"
@@ -105,7 +108,7 @@ def _is_message(node: ast.AST) -> bool:
 
 
 def _changes(node: ast.AST) -> Iterator[tuple[str, Change]]:
-    """Description and function of everything that can go wrong in a node."""
+    """Yield description and function of each mistake that a node may have."""
     match node:
         case ast.Compare():
             for place, operator in enumerate(node.ops):
@@ -138,7 +141,7 @@ def _setter(field: str, value: object, place: int | None = None) -> Change:
 
 
 def _numbers(number: float) -> tuple[float, ...]:
-    """What a number may be by mistake: by one where that is little, else by a share."""
+    """Return the wrong values of a number: off by one if it is small, else by `SHARE`."""
     if isinstance(number, int):
         if abs(number) <= BY_ONE_MAX:
             return number + 1, number - 1

@@ -5,11 +5,11 @@
 takes the mutants of a file or a line.
 
 The mistakes: a comparison, an operator, a `not`, `and` or `or`, a number by one; a float or a large
-number by 20 %, for one nanosecond means nothing. Nothing is changed in place: a mutant is a
-compiled file in a copy of the tree, which Python and whatever a test starts take for the source's.
+number by 20 %, as one nanosecond means nothing. No source is changed: a mutant is a compiled file
+in a copy of the tree, which Python and all processes of a test run instead of the source.
 
 mutmut leaves numbers outside functions alone; cosmic-ray changes files in place, one command for
-all; neither picks a sample by a seed. Hence our own.
+all; neither picks a sample by a seed. So this is a program of our own.
 """
 
 from __future__ import annotations
@@ -46,42 +46,42 @@ NUMBER = 200
 KILLED_SHARE = 0.9
 """Share of the mutants that the tests must notice."""
 LEFT_OUT = ("drivers/twins/",)
-"""Test equipment."""
+"""Beginnings of paths that get no mutants, as they are test equipment."""
 TESTS_S = 60.0
-"""Tests that a mutant gets, by the time that they take without it, s."""
+"""Total time without a mutant, s, of the tests that are chosen for each mutant."""
 SLACK, SLACK_S = 5.0, 10.0
-"""A test that takes longer than this many times its usual time, and this, s, hangs."""
+"""A test hangs if it takes longer than `SLACK` times its usual time plus `SLACK_S`."""
 RUN_S = 60.0
-"""Pytest starts in that time, s, on whatever machine: what is over it hangs outside of a test."""
+"""Longest start of pytest on a slow machine, s; a run that takes longer hangs outside of a test."""
 WARM = ("can", "msgspec", "numpy", "onnxruntime", "pydantic", "serial", "zmq")
-"""Imported once for all mutants."""
+"""Modules imported once, before the processes for the mutants are forked."""
 UNCHECKED: Final = (1).to_bytes(4, "little")
 """Flags of a compiled file that is never compared with its source (PEP 552)."""
 
 
 @dataclass(eq=False)
 class Baseline:
-    """What the tests do without a mutant. As a plugin of pytest it finds that out."""
+    """Results of the tests without a mutant; as a plugin of pytest it collects them."""
 
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
-    """By test."""
+    """Time of each test, by its node id, s."""
     failed: list[str] = dataclasses.field(default_factory=list)
     tests: dict[str, dict[str, list[str]]] = dataclasses.field(default_factory=dict)
-    """By file and line (as text) the tests that execute it."""
+    """Tests that execute a line, by file and by line (as text)."""
     naming: dict[str, list[str]] = dataclasses.field(default_factory=dict)
-    """Tests in files that name a module, by the module's file."""
+    """Tests whose file mentions a module by name, by the module's file."""
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """A part of a test is done."""
+        """Add up the time of a test's parts, and note its failure."""
         self.seconds[report.nodeid] = self.seconds.get(report.nodeid, 0.0) + report.duration
         if report.failed:
             self.failed.append(report.nodeid)
 
     def concerned(self, mutant: Mutant, seconds: float) -> dict[str, float]:
-        """The tests that run a mutant, the fastest in `seconds` altogether, and their times.
+        """Return the tests that run a mutant, fastest first up to `seconds` in total, and times, s.
 
-        Those that execute its statement; where none does, for it is executed by importing, all that
-        execute anything of its file, and those whose file names its module.
+        These execute its statement. If none does, as the statement runs on import: all that execute
+        any line of its file, and those whose file names its module.
         """
         lines = self.tests.get(mutant.file, {})
         found = {
@@ -106,16 +106,16 @@ class Contexts:
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Generator[None, bool, bool]:
-        """A test runs, with its fixtures."""
+        """Have coverage note the lines that a test and its fixtures execute under its id."""
         self._measure.switch_context(item.nodeid)
         return (yield)
 
 
 class SameExamples:
-    """Plugin of pytest: hypothesis tries the same every time, and never simplifies."""
+    """Plugin of pytest: hypothesis tries the same examples every time, and never shrinks them."""
 
     def pytest_sessionstart(self) -> None:
-        """After the conftest with its own profile, before any test is imported."""
+        """Load the profile, after that of the conftest and before any test is imported."""
         phases = (Phase.explicit, Phase.generate)
         settings.register_profile("mutants", settings(), derandomize=True, phases=phases)
         settings.load_profile("mutants")
@@ -125,13 +125,14 @@ class Chosen:
     """Plugin of pytest: runs the chosen tests, the fastest files first."""
 
     def __init__(self, seconds: Mapping[str, float], known: Collection[str]) -> None:
-        """`known` are all tests without a mutant: one that a mutant has renamed runs, too."""
+        """`seconds`: chosen tests and their usual times. `known`: all tests without a mutant; those
+        that a mutant has renamed run too."""
         self._seconds = seconds
         self._known = known
 
     @pytest.hookimpl(trylast=True)
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
-        """Drop the others, and limit the times."""
+        """Keep the chosen tests, limit the time of each, and sort them."""
         items[:] = [
             item for item in items if item.nodeid in self._seconds or item.nodeid not in self._known
         ]
@@ -147,7 +148,7 @@ class Workshop:
     """A copy of the tree in which mutants are run."""
 
     def __init__(self, root: Path, folder: Path, package: str, tests: Sequence[str]) -> None:
-        """`folder` is empty; `tests` are paths from the root."""
+        """Copy the tree at `root` into the empty `folder`. `tests`: paths from the root."""
         self._folder, self._package, self._tests = folder, package, tests
         self._log = folder / "last-run.log"
         ignored = shutil.ignore_patterns(".*", "__pycache__")
@@ -157,7 +158,7 @@ class Workshop:
                 importlib.import_module(module)
 
     def baseline(self) -> Baseline:
-        """Run all tests once. Raises `RuntimeError` if that cannot be done."""
+        """Run all tests once without a mutant. Raises `RuntimeError` if pytest cannot."""
         report = self._folder / "baseline.json"
         status = _forked(lambda: self._measure(report), None, self._log)
         if status not in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED):
@@ -167,9 +168,9 @@ class Workshop:
         return found
 
     def notices(self, mutant: Mutant, seconds: Mapping[str, float], known: Collection[str]) -> bool:
-        """Whether one of the tests fails, or hangs.
+        """Return True if with the mutant one of the tests in `seconds` fails or hangs.
 
-        A run that is cut off outside of a test shows nothing: it counts as unnoticed, and is said.
+        A run that is cut off outside of a test counts as unnoticed, and is reported.
         """
         module = self._folder / mutant.file
         compiled = Path(importlib.util.cache_from_source(str(module)))
@@ -211,7 +212,7 @@ class Workshop:
         return status
 
     def _pytest(self, arguments: Sequence[str], plugins: Sequence[object]) -> int:
-        """Run tests in the copy, as if this process had never seen the original."""
+        """Run pytest on the copy, with no module of the original loaded; return its exit code."""
         os.chdir(self._folder)
         sys.path[:1] = places = [str(self._folder / "deploy" / "package"), str(self._folder)]
         os.environ["PYTHONPATH"] = os.pathsep.join(places)
@@ -225,9 +226,9 @@ class Workshop:
 
 
 def _forked(task: Callable[[], int], limit_s: float | None, log: Path) -> int | None:
-    """Exit status of a task in a process of its own; None if it took too long.
+    """Run a task in a forked process; return its exit status, None if it took over `limit_s`.
 
-    `log` is overwritten with what it says.
+    `log` is overwritten with its output. `limit_s` None: no limit.
     """
     pid = os.fork()
     if pid == 0:
@@ -255,7 +256,7 @@ def _forked(task: Callable[[], int], limit_s: float | None, log: Path) -> int | 
 
 
 def modules(root: Path, package: str, only: Sequence[str]) -> Iterator[Mutant]:
-    """All mutants of a package that are picked from; `only` has ends of paths, `:LINE` or not."""
+    """Yield all mutants of a package; with `only`, of files whose path ends so, or `FILE:LINE`."""
     for path in sorted((root / package).rglob("*.py")):
         file = path.relative_to(root).as_posix()
         if file.startswith(LEFT_OUT):
@@ -268,7 +269,7 @@ def modules(root: Path, package: str, only: Sequence[str]) -> Iterator[Mutant]:
 
 
 def run(root: Path, options: argparse.Namespace) -> tuple[list[Mutant], list[Mutant]]:
-    """The mutants that were picked, and those that no test noticed."""
+    """Run tests on a random sample of mutants; return all of it, and those that no test noticed."""
     found = list(modules(root, options.package, options.only))
     picked = random.Random(options.seed).sample(found, min(options.number, len(found)))
     picked.sort(key=lambda mutant: (mutant.file, mutant.line, mutant.place))
@@ -290,7 +291,7 @@ def run(root: Path, options: argparse.Namespace) -> tuple[list[Mutant], list[Mut
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Pick, run, and print a table; 1 if too few are noticed."""
+    """Pick and run mutants, and print a table; return 1 if too few are noticed."""
     parser = argparse.ArgumentParser(
         prog="python -m tests.bench.mutants",
         description=__doc__,

@@ -40,34 +40,34 @@ from tests.bench.live import (
 from tests.daemon.processes import GRASPD, before_others
 
 SLOPE_MAX_KIB_PER_H = 1024.0
-"""3 bytes per reading at 100 Hz, less than any object that could be kept of each."""
+"""Largest growth of memory, KiB/h: 3 bytes per reading at 100 Hz, less than any object kept."""
 GRAIN_KIB = 512
 """Growth below this is not a leak yet: an allocator takes pages as it likes. In the second minute
 of two at 100 Hz it is 87 bytes per reading; the smallest array has 112."""
 SPAN_MIN_S = 45.0
-"""What the daemon holds is shown and not judged in a shorter span, s."""
+"""Shortest span after the warm-up, s, whose memory and descriptors are judged, not only shown."""
 MOST_SHARE = 0.9
 WARM_UP_S, WARM_UP_SHARE = 60.0, 0.5
 """Memory and descriptors are not judged in the first minute: caches fill, the first outages come.
 They grew 1.8 MiB in the first 20 s, 0.4 MiB in the next 40 s, and 0.2 MiB in the minute after.
 A run of less than two minutes warms up for this share of it."""
 SLOPE_SAMPLES = 500
-"""Most samples of an hour's 7200: all pairs of them are looked at."""
+"""Most samples that the slope uses, of 7200 an hour, as it uses all pairs of them."""
 
 
 @dataclass(slots=True)
 class Heard:
-    """What a subscriber makes of the stream."""
+    """Counts of the messages that a subscriber received."""
 
     messages: int = 0
     readings: int = 0
-    """Verdicts of another time than the one before; the others say that no reading came."""
+    """Verdicts with another reading time than the one before; others say that no reading came."""
     gaps: int = 0
     boots: set[str] = field(default_factory=set)
     _last: Verdict | None = None
 
     def add(self, verdict: Verdict) -> None:
-        """Take in a message."""
+        """Count a verdict."""
         former, self._last = self._last, verdict
         self.messages += 1
         if verdict.boot_id not in self.boots:
@@ -79,18 +79,18 @@ class Heard:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """What is known when a soak is over."""
+    """Results of a soak."""
 
     samples: Sequence[Usage]
-    """What the daemon used, sample by sample."""
+    """Memory, descriptors and threads of the daemon, one sample each `SAMPLE_S`."""
     heard: Heard
     outages: int
-    """Twins that were killed, and subscribers that were stopped."""
+    """Number of times that a twin was killed or a subscriber stopped."""
     exit_code: int
     planned: float = 0.0
     """Readings that would have come without faults and outages."""
     ended_early: bool = False
-    """Whether the daemon was gone before it was told to stop."""
+    """True if the daemon ended before it was told to stop."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,22 +104,22 @@ class Row:
 
     @property
     def broken(self) -> bool:
-        """Whether the value is beyond its limit."""
+        """True if the value is above its limit; False without a limit."""
         return self.limit is not None and self.value > self.limit
 
     def cells(self) -> tuple[str, str, str]:
-        """Name, value and limit as in the table."""
+        """Return name, value and limit as text for the table; a broken value has a `!`."""
         limit = "" if self.limit is None else f"{self.limit:g}"
         value = f"{self.value:,.2f}".rstrip("0").rstrip(".")
         return self.name, f"{value} {self.unit}{' !' if self.broken else ''}".strip(), limit
 
 
 FEW = 0.2
-"""Share of the planned readings that must have come: with fewer nothing has been tried."""
+"""Smallest share of the planned readings that must come: with fewer the soak tried too little."""
 
 
 def judge(found: Found) -> list[Row]:
-    """Everything that was found, beside its limit."""
+    """Return the rows of the table, each with a value and its limit."""
     heard = found.heard
     return [
         Row("readings", heard.readings),
@@ -134,7 +134,7 @@ def judge(found: Found) -> list[Row]:
 
 
 def _resources(samples: Sequence[Usage]) -> list[Row]:
-    """What the daemon holds, from the end of its warm-up on."""
+    """Return the rows of memory, descriptors and threads, from the end of the warm-up on."""
     began_s, ended_s = samples[0].t_s, samples[-1].t_s
     warm_s = began_s + min(WARM_UP_SHARE * (ended_s - began_s), WARM_UP_S)
     judged = [sample for sample in samples if sample.t_s >= warm_s]
@@ -157,28 +157,29 @@ def _resources(samples: Sequence[Usage]) -> list[Row]:
 
 
 def most(name: str, samples: Sequence[Usage]) -> float:
-    """How many are held nine times in ten: the link comes and goes, a file is open for a moment."""
+    """Return the number of a resource that nine samples in ten do not exceed, as a link or a file
+    may be open for a moment."""
     held = [getattr(sample, name) for sample in samples]
     return float(np.quantile(held, MOST_SHARE, method="lower"))
 
 
 SAMPLE_S = 0.5
 IDLE_S = 0.05
-"""Longest time without a look at what is due."""
+"""Longest wait before outages and samples that are due, s."""
 BETWEEN_S = (1.0, 8.0)
-"""Between two outages."""
+"""Range of the time between two outages, s."""
 HURRY_S = 60.0
-"""A shorter run has shorter outages, so that it has some of each kind."""
+"""Run length, s, below which outages are shorter, so that each kind occurs."""
 AWAY_S = (0.1, 2.0)
-"""How long a killed twin stays away."""
+"""Range of the time until a killed twin is replaced, s."""
 STOPPED_S = (1.0, 5.0)
-"""How long a subscriber is stopped: less than its queue holds at 100 Hz."""
+"""Range of the time for which a subscriber is stopped, s: less than its queue holds at 100 Hz."""
 FAULTS = (
     *("--bit-flip", "0.002", "--drop", "0.002", "--duplicate", "0.002"),
     *("--disconnect-every", "500", "--dead", "ff_3", "--dead", "th_17"),
 )
 QUEUE = 1000
-"""Messages that wait for a subscriber: on a busy computer, where it is slow, it loses none."""
+"""Most messages that wait for a subscriber: enough that a slow one loses none."""
 LISTENER = """
 import sys, zmq
 socket = zmq.Context().socket(zmq.SUB)
@@ -189,12 +190,12 @@ print("hears", flush=True)
 while True:
     socket.recv_multipart()
 """
-"""A subscriber that does nothing with what it hears, and says when that begins."""
+"""Program of a subscriber that drops what it receives, and prints a line at the first message."""
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What a soak shall do."""
+    """Length, rate and seed of a soak."""
 
     seconds: float
     rate_hz: float = 100.0
@@ -215,7 +216,7 @@ class Soak:
         self._outages = 0
 
     def run(self) -> Found:
-        """Do it. Raises `RuntimeError` if the daemon does not start, with what it said."""
+        """Run the soak. Raises `RuntimeError` with the daemon's log if that does not start."""
         sections = f'{spi_section(self._folder)}[session]\nfolder = "{self._folder}/session"\n'
         listener = [sys.executable, "-c", LISTENER, f"ipc://{self._folder}/v"]
         with (
@@ -252,7 +253,8 @@ class Soak:
         return self._daemon.poll() is not None
 
     def _hear(self, done: Callable[[], bool], seconds: float) -> None:
-        """Listen, do what is due and look at the daemon, up to a time."""
+        """Receive verdicts, run outages that are due and sample the daemon, for `seconds` or until
+        `done`."""
         until_s = time.monotonic() + seconds
         while (now_s := time.monotonic()) < until_s and not done():
             verdict = self._subscriber.verdict(min(until_s - now_s, IDLE_S))
@@ -265,7 +267,7 @@ class Soak:
                 self._sample_s = now_s + SAMPLE_S
 
     def _plan_deeds(self) -> None:
-        """Each outage and its end, in the order of time, both kinds in turn."""
+        """Draw begin and end of each outage, in the order of time, both kinds in turn."""
         at_s = time.monotonic()
         end_s = at_s + self._plan.seconds
         pace = min(self._plan.seconds / HURRY_S, 1.0)
@@ -309,7 +311,7 @@ class Soak:
 
 
 def main() -> int:
-    """Print the table; 1 if a limit is broken."""
+    """Run a soak and print its table; return 1 if a limit is broken."""
     parser = argparse.ArgumentParser(prog="python -m tests.bench.soak", description=__doc__)
     parser.add_argument("--seconds", type=float, default=120.0)
     parser.add_argument("--rate", type=float, default=100.0, metavar="HZ")

@@ -1,8 +1,8 @@
-"""The time of a sweep from the serial line to a subscriber, by a daemon and by an empty echo.
+"""Measure a sweep's time from the serial line to a subscriber, by a daemon and by a mere echo.
 
 `python -m tests.bench.wire` prints it for several hands at 100 Hz, each with its own twin, on an
 idle computer and beside a busy process for each core. Daemons and echoes take turns. An echo reads
-the same line and publishes its bytes as they come. It takes twelve minutes, `--quick` one
+the same line and publishes its bytes as they come. The run takes twelve minutes, `--quick` one
 minute, and needs the extra `train`.
 """
 
@@ -48,20 +48,20 @@ ROUNDS, QUICK_ROUNDS = 3, 1
 SECONDS, QUICK_SECONDS = 10.0, 3.0
 """Time that is measured in each turn, s."""
 WARM_UP = 50
-"""Messages of each hand before that."""
+"""Messages of each hand before the measurement begins."""
 READ_BYTES = 4096
 QUANTILES = (0.5, 0.99, 0.999)
 BUSY = "while True: pass"
 TITLES = ("hands", "load", "way", "sweeps", "p50, us", "p99, us", "p99.9, us")
 
 Heard = list[tuple[int, bytes]]
-"""When each message came, monotonic ns, and its payload."""
+"""Time at which each message came, monotonic ns, and its payload."""
 Written = NDArray[np.int64]
 """Tick at each sweep's end, monotonic time of that, ns, and when its bytes were written, (N, 3)."""
 
 
 class WireTwin(SpiTwin):
-    """Notes when it writes each sweep."""
+    """SPI twin that notes when it writes each sweep."""
 
     def __init__(self, path: Path) -> None:
         counts = (moment.counts for moment in synthetic_grasps(rate_hz=RATE_HZ, loop=True))
@@ -76,7 +76,7 @@ class WireTwin(SpiTwin):
 
 
 def serve_twin(folder: Path) -> None:
-    """Be a twin until SIGTERM; then save `written.npy`."""
+    """Run a twin at `bridge` in `folder` until SIGTERM; then save `written.npy` there."""
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda _number, _frame: stop.set())
     with WireTwin(folder / "bridge") as twin:
@@ -85,7 +85,7 @@ def serve_twin(folder: Path) -> None:
 
 
 def serve_echo(folder: Path) -> None:
-    """Publish what comes over the line, until the twin has gone."""
+    """Start the twin's sweeps, and publish the bytes from its line until the twin has gone."""
     line = os.open(folder / "bridge", os.O_RDWR | os.O_NOCTTY)
     with zmq.Context() as context, context.socket(zmq.PUB) as socket:
         socket.bind(f"ipc://{folder}/v")
@@ -96,12 +96,12 @@ def serve_echo(folder: Path) -> None:
 
 
 def own(what: str, folder: Path) -> Child:
-    """Start a process of this bench."""
+    """Start a process of this module: `what` is `twin` or `echo`."""
     return Child([sys.executable, "-m", "tests.bench.wire", what, str(folder)])
 
 
 def turn(way: Way, hands: int, seconds: float) -> list[int]:
-    """Return the time of each sweep of all hands from its line to the subscriber, ns."""
+    """Measure for `seconds`; return each sweep's time from line to subscriber, of all hands, ns."""
     with tempfile.TemporaryDirectory() as root, ExitStack() as stack:
         folders = [Path(root) / f"hand{hand}" for hand in range(hands)]
         twins = []
@@ -127,8 +127,8 @@ def turn(way: Way, hands: int, seconds: float) -> list[int]:
 
 
 def listen(endpoints: Sequence[str], seconds: float) -> Mapping[str, Heard]:
-    """Return the messages of each hand, once all hands have sent `WARM_UP`.
-    Raises `TimeoutError`."""
+    """Return the messages of `seconds` by hand, from when all hands have sent `WARM_UP`.
+    Raises `TimeoutError` if one never does."""
     heard: dict[str, Heard] = {}
     with zmq.Context() as context, context.socket(zmq.SUB) as socket:
         socket.rcvhwm = 0
@@ -169,7 +169,7 @@ def times_of(way: Way, heard: Heard, written: Written) -> Iterator[int]:
 
 
 def main() -> int:
-    """Print the table."""
+    """Measure all combinations of hands, load and way, and print the table."""
     parser = argparse.ArgumentParser(prog="python -m tests.bench.wire", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="does it run?")
     quick = parser.parse_args().quick

@@ -1,1 +1,1 @@
-"""What an attacker or a broken board may try, and what happens: see `__main__`."""
+"""Attacks that hostile peers may try on a daemon, and their results: see `__main__`."""

@@ -1,7 +1,7 @@
-"""Attacks a daemon over its real doors, and prints how often, and what happened.
+"""Attack a daemon through its real sockets, and print how often, and what happened.
 
-deploy/ATTACKS.md says what each tries. `python -m tests.bench.attacks --minutes 60` shares the time
-evenly; `--only NAME` tries one. Exits with 1 if something did not hold.
+deploy/ATTACKS.md says what each attack tries. `python -m tests.bench.attacks --minutes 60` shares
+the time evenly among them; `--only NAME` tries one. Exits with 1 if graspd failed in one.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ ATTACKS: Final[dict[str, Callable[[Plan], Outcome]]] = {
     "flood": doors.flood,
     "ping-hangup": hang_ups.hang_ups,
 }
-"""By name, in the order of the page. What one raises counts as not held."""
+"""Attacks by name, in the order of deploy/ATTACKS.md. One that raises counts as not held."""
 HEAD = ("attack", "how often", "what happened", "held")
 
 log = logging.getLogger("attacks")
 
 
 def tried(name: str, seconds: float, seed: int) -> Outcome:
-    """What came of one attack; what it raises is not held."""
+    """Run one attack for about `seconds`; return its outcome, not held if it raises."""
     with tempfile.TemporaryDirectory(prefix="graspd-") as folder:
         try:
             return ATTACKS[name](Plan(seconds, random.Random(f"{name}-{seed}"), Path(folder)))

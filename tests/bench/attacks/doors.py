@@ -1,4 +1,4 @@
-"""Hostile peers: connections by the thousand, noise, floods that keep every rule."""
+"""Hostile peers: thousands of connections, noise, and floods that obey the protocol."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ from tests.threads import at_work
 MEMORY_MAX_MIB = 32.0
 """Largest growth of the daemon's memory, MiB."""
 CONNECTIONS = 2500
-"""In one round to each socket, of each kind."""
+"""Connections of each kind to each socket in one round."""
 OPEN_MAX = 1500
 """Most connections at a time."""
 FLOOD_S = 1.5
 FLOODERS = 8
 KEEPING_RULES_S = 3.0
-"""How long the loop's cost is measured, without and with peers that keep every rule."""
+"""Time for which the loop's cost is measured, without and with a flood of valid messages, s."""
 ADDED_MAX_MS = 2.0
 """Processor time that a flood may add to a round of the loop, ms. It adds 0.05 to 0.5, by
 the machine; a server in the loop itself took 3.6 to 6.2."""
 HEARD_MIN = 0.95
 """Smallest share of the verdicts given that must be received in a flood."""
 PATIENCE_MS = 500
-"""A question is answered by then."""
+"""Time by which the daemon answers a question, ms (`request_ms`)."""
 GREETING = bytes.fromhex("ff 00 00 00 00 00 00 00 01 7f 03 01 4e 55 4c 4c") + bytes(48)
 READY = bytes.fromhex("04 19 05") + b"READY\x0bSocket-Type\x00\x00\x00\x03"
 READY_DEALER = bytes.fromhex("04 1c 05") + b"READY\x0bSocket-Type\x00\x00\x00\x06DEALER"
@@ -56,25 +56,25 @@ KEEPS_RULES = (
     (1, AS_DEALER, QUESTION * 300),
     (1, AS_DEALER, (bytes.fromhex("00 09") + b"outcome x") * 200),
 )
-"""Door, greeting and messages of peers that keep every rule: SUBSCRIBE and CANCEL in turns, two
-bytes, questions, malformed outcomes."""
+"""Socket (0: messages, 1: questions), greeting and messages of peers that obey the protocol:
+SUBSCRIBE and CANCEL in turns, two bytes, questions, malformed outcomes."""
 
 Connect = Callable[[], socket.socket]
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What an attack is given."""
+    """Time, random numbers and folder for one attack."""
 
     seconds: float
-    """How long it lasts, s; a round that has begun is ended. It does one at least."""
+    """Time after which no further round begins, s; there is at least one."""
     random: random.Random
-    """For all that it draws."""
+    """Source of all random numbers of the attack."""
     folder: Path
-    """For its files and sockets; removed afterwards."""
+    """Folder for files and sockets; removed afterwards."""
 
     def rounds(self) -> Iterator[int]:
-        """0, 1, 2 ... until the time is over."""
+        """Yield 0, 1, 2 ... until `seconds` are over; at least 0."""
         end_s = time.monotonic() + self.seconds
         tried = 0
         while tried == 0 or time.monotonic() < end_s:
@@ -82,7 +82,7 @@ class Plan:
             tried += 1
 
     def folders(self) -> Iterator[Path]:
-        """A new folder for each round."""
+        """Yield a new folder for each round."""
         for number in self.rounds():
             folder = self.folder / str(number)
             folder.mkdir()
@@ -91,19 +91,19 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What came of it."""
+    """Result of an attack."""
 
     tried: int
-    """How often: readings, connections, bytes or what else the attack counts."""
+    """Number of connections, bytes or what else the attack counts."""
     happened: str
     """Result in plain words with figures, such as "0 of 995 verdicts `stable`"."""
     held: bool
-    """Whether graspd did what it must."""
+    """True if graspd did what it must."""
 
 
 @dataclass(slots=True)
 class Hand:
-    """A daemon, its doors, and a friend that hears it."""
+    """A daemon under attack, its endpoints, and a subscriber that does no harm, its `friend`."""
 
     process: Child
     publish: str
@@ -113,11 +113,12 @@ class Hand:
 
     @property
     def doors(self) -> tuple[Connect, Connect]:
-        """Connect to the messages, and to the questions."""
+        """Functions that connect to the socket of the messages, and to that of the questions."""
         return partial(connect, self.publish), partial(connect, self.ask)
 
     def outcome(self, tried: int, well: bool = True, said: str = "") -> Outcome:
-        """What became of it: whether it lives, its messages arrive, and it has little memory."""
+        """Return the outcome after an attack; held if `well`, the daemon runs, its messages arrive,
+        and its memory grew little. `said`: the attack's own figures."""
         self.friend.drain()
         grown_mib = peak_mib(self.process.pid) - self.rest_mib
         lives = self.process.poll() is None
@@ -137,7 +138,10 @@ def hand(
     tcp: bool = False,
     high_water_mark: int | None = None,
 ) -> Iterator[Hand]:
-    """A daemon at rest: on Unix sockets, or on TCP, with keys; the rest as of `running`."""
+    """Run a daemon that replays the demo table, without an attack yet.
+
+    On Unix sockets, on TCP if `tcp`, and on TCP with keys if `curve`; others: see `running`.
+    """
     endpoint, questions = f"ipc://{folder}/v", f"ipc://{folder}/ask"
     section, keys = "", None
     if curve:
@@ -169,7 +173,7 @@ def hand(
 
 
 def connect(endpoint: str) -> socket.socket:
-    """A connection. Raises `OSError`."""
+    """Return a connected, non-blocking socket. Raises `OSError` if refused."""
     scheme, _, where = endpoint.partition("://")
     family = socket.AF_UNIX if scheme == "ipc" else socket.AF_INET
     made = socket.socket(family, socket.SOCK_STREAM)
@@ -186,7 +190,7 @@ def connect(endpoint: str) -> socket.socket:
 
 
 def connections(plan: Plan) -> Outcome:
-    """Many, that say nothing or half of what they must, or are subscribers and do not read."""
+    """Attack by many connections that send nothing, half a greeting, or subscribe and read none."""
     tried = 0
     with hand(plan.folder, curve=True) as daemon:
         for _ in plan.rounds():
@@ -210,7 +214,7 @@ def _many(door: Connect, says: bytes) -> int:
 
 
 def _flood(door: Connect, numbers: random.Random) -> int:
-    """Send noise as fast as can be, with some connections, for a while; how many bytes it was."""
+    """Send random bytes as fast as possible over `FLOODERS` connections; return their number."""
     sent, until_s = 0, time.monotonic() + FLOOD_S
     left: list[bytes] = [b""] * FLOODERS
     flooders: list[socket.socket | None] = [None] * FLOODERS
@@ -237,7 +241,7 @@ def _flood(door: Connect, numbers: random.Random) -> int:
 
 
 def noises(plan: Plan) -> Outcome:
-    """Anything, by many peers."""
+    """Attack by peers that send random bytes."""
     sent = 0
     with hand(plan.folder) as daemon:
         for _ in plan.rounds():
@@ -247,7 +251,7 @@ def noises(plan: Plan) -> Outcome:
 
 
 def flood(plan: Plan) -> Outcome:
-    """Eight peers that keep every rule, as fast as can be."""
+    """Attack by eight peers that send valid messages as fast as possible."""
     tried, added_ms, share = 0, 0.0, 1.0
     # As many as the friend takes late; by default ten wait for a subscriber.
     with hand(plan.folder, high_water_mark=1000) as daemon:
@@ -268,7 +272,8 @@ def flood(plan: Plan) -> Outcome:
 
 
 def cost(daemon: Hand) -> tuple[float, float]:
-    """Processor time of the loop's thread for each verdict, ms, and share of verdicts received."""
+    """Measure the processor time of the loop's thread for each verdict, ms, and the share of the
+    verdicts that the friend received; infinite and 0 if one never came."""
     daemon.friend.drain()
     path = Path(f"/proc/{daemon.process.pid}/task/{daemon.process.pid}/schedstat")
     end_s, began_ns = time.monotonic() + KEEPING_RULES_S, int(path.read_text().split()[0])

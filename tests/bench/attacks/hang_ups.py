@@ -1,4 +1,4 @@
-"""Peers that fill a queue, send a heartbeat and hang up: libzmq 4.3.5 ends its process there."""
+"""Peers that fill a queue, send a heartbeat and hang up, whereupon libzmq 4.3.5 aborts."""
 
 from __future__ import annotations
 
@@ -32,20 +32,20 @@ HANG_UPS = (
     (AS_DEALER, b"READY", (b"\0\5clock") * 40 + PING),
     (AS_DEALER, b"READY", (b"\0\5clock") * 40 + PING * 20),
 )
-"""What a peer says, what it waits for, and what it says before it hangs up."""
+"""Bytes that a peer sends, that it waits for, and that it sends before it hangs up."""
 HANG_UPS_AT_ONCE, WITH_KEYS = 50, 20
 """Peers of each kind, without keys and with keys."""
 MADE_MIN = 0.8
-"""Smallest share of the verdicts at rest that must be made. A start of a process costs some ms."""
+"""Smallest rate of verdicts during the attack, as a share of that at rest: restarts cost some."""
 FILLING = 300
 """Subscriptions or questions of a peer with keys: more than the queue takes."""
 REST_S = 2.0
 RESTART_S = 3.0
-"""Longest start of libzmq's process."""
+"""Longest restart of the daemon's process that runs libzmq, s."""
 
 
 def hang_ups(plan: Plan) -> Outcome:
-    """Fill a queue, send a heartbeat and hang up, in every state of the handshake."""
+    """Attack by peers that fill a queue, send a heartbeat and hang up, in all handshake states."""
     tried, ends, share = 0, 0, 1.0
     for folder in plan.folders():
         for number, (tcp, keyed) in enumerate(((False, False), (True, False), (True, True))):
@@ -74,7 +74,7 @@ def hang_ups(plan: Plan) -> Outcome:
 
 
 def _made_hz(daemon: Hand, seconds: float) -> float:
-    """Return how many verdicts are made, 1/s, by their numbers over some time."""
+    """Return the rate at which the daemon makes verdicts, 1/s, by their `seq` over `seconds`."""
     daemon.friend.drain()
     first, began_s = daemon.friend.wait_for(lambda _: True), time.monotonic()
     time.sleep(seconds)
@@ -84,7 +84,10 @@ def _made_hz(daemon: Hand, seconds: float) -> float:
 
 
 def hang_up(door: Connect, first: bytes, awaited: bytes, then: bytes) -> int:
-    """Return the number of peers that said all."""
+    """Have `HANG_UPS_AT_ONCE` peers send `first`, wait for `awaited`, send `then` and hang up.
+
+    Return the number of those that sent all.
+    """
     with contextlib.ExitStack() as stack:
         peers = []
         for _ in range(HANG_UPS_AT_ONCE):
@@ -107,7 +110,8 @@ def hang_up(door: Connect, first: bytes, awaited: bytes, then: bytes) -> int:
 
 
 def _hang_up_with_keys(endpoint: str, kind: int, folder: Path) -> int:
-    """Do the same as peers that may connect, subscribers or askers; libzmq sends heartbeats."""
+    """Fill queues and hang up as `WITH_KEYS` peers with keys, of socket type `kind`; return their
+    number. libzmq sends their heartbeats."""
     own, server = load_pair(folder / "clients" / "friend.key_secret"), folder / "daemon.key_secret"
     with zmq.Context() as context:
         for _ in range(WITH_KEYS):
