@@ -1,7 +1,7 @@
-"""`python -m tests.system`: the service in a real Debian on a real kernel, from nothing.
+"""`python -m tests.system`: install and test the service in an emulated machine with Debian.
 
-Needs the Debian packages mmdebstrap, qemu-system-x86 and e2fsprogs; who is not root also fakeroot
-and uidmap.
+Needs the Debian packages mmdebstrap, qemu-system-x86 and e2fsprogs; without root also fakeroot and
+uidmap.
 """
 
 from __future__ import annotations
@@ -46,15 +46,15 @@ STEPS: Final[tuple[Step, ...]] = (
     steps_install.enabled,
     steps_install.uninstall,
 )
-"""Grasps come over both links from `start` on, while the other steps are done. The recording that a
-full disk ends must hold some: `serial_verdicts` waits for them. What takes its time by itself is
-begun by one step and awaited by a later one: `recording_again`, `hung`."""
+"""Steps in order. From `start` on grasps come over both links. `serial_verdicts` waits for some, so
+that the recording that `disk_full` ends holds them. `disk_full` and `hangs` begin what
+`recording_again` and `hung` await."""
 NEEDED: Final = frozenset((steps_install.prepare, steps_install.install, steps_install.start))
-"""Without these there is no use in going on."""
+"""Steps whose failure ends the run."""
 
 
 class Table:
-    """Lines of what was done, how long it took, how long a recovery took, and what was seen."""
+    """Prints a line for each step: result, name, time, time to recover, and what was seen."""
 
     def __init__(self) -> None:
         self.failed: list[str] = []
@@ -63,14 +63,14 @@ class Table:
 
     @contextlib.contextmanager
     def timed(self, name: str) -> Iterator[list[str]]:
-        """Time what is done within; what is put into the list is what was seen."""
+        """Time the block and print its line; the block adds what was seen to the list."""
         began_s = time.monotonic()
         seen: list[str] = []
         yield seen
         _write("ok", name, f"{time.monotonic() - began_s:.1f}", "", " ".join(seen))
 
     def run(self, step: Step, lab: Lab) -> bool:
-        """Do a step; whether all was as it must be."""
+        """Run a step and print its line; return True if it succeeded."""
         name = step.__name__.replace("_", " ")
         began_s = time.monotonic()
         mark, recovery = "ok", ""
@@ -87,7 +87,7 @@ class Table:
         return mark == "ok"
 
     def end(self) -> None:
-        """The last line."""
+        """Print the last line: failed steps, and the time of the whole run."""
         took_s = time.monotonic() - self._began_s
         verdict = f"failed: {', '.join(self.failed)}" if self.failed else "all is well"
         sys.stdout.write(f"{verdict}, in {took_s:.0f} s, under software emulation\n")
@@ -99,7 +99,7 @@ def _write(mark: str, step: str, took: str, recovery: str, seen: str) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run all steps; 0 if all is as it must be, 1 if something is not, 2 if it cannot be tried."""
+    """Run all steps; return 0 if all succeed, 1 if one fails, 2 if the machine cannot be run."""
     parser = argparse.ArgumentParser(prog="python -m tests.system", description=__doc__)
     parser.add_argument(
         "--rebuild", action="store_true", help="build the image even if it is there"
@@ -138,7 +138,7 @@ def _run(folder: Path, rebuild: bool, table: Table) -> None:
 
 
 def _explain(machine: Machine) -> None:
-    """What the journal has, to look into a failure."""
+    """Write the end of the machine's journal and its failed units to stderr."""
     with contextlib.suppress(MachineError):
         said = machine.run("journalctl -q --no-pager -n 60 -p notice; systemctl --failed").out
         sys.stderr.write(said + "\n")

@@ -1,4 +1,4 @@
-"""What the steps share: the machine, the twins on both sides of it, questions to it."""
+"""Parts that all steps share: the machine, the twins of both hands, and calls to ask and wait."""
 
 from __future__ import annotations
 
@@ -23,42 +23,45 @@ PAYLOAD: Final = "/payload"
 PYTHON: Final = "/opt/graspd/venv/bin/python"
 HANDS: Final = ("can", "serial")
 MEMBER, STRANGER = "member", "stranger"
-"""Users inside: of the group graspd, and of none."""
+"""Users inside the machine: in the group graspd, and in none."""
 RATE_HZ: Final = 20.0
-"""Sweeps/s of each hand: what two emulated processors judge without falling behind."""
+"""Sweeps/s of each hand: as many as two emulated processors can judge."""
 GRASPS: Final = Durations(first_rest_s=(6.5, 6.5), settle_s=(2.0, 2.0), rest_s=(6.5, 6.5))
-"""At a fifth of the usual rate it takes as much longer to learn where the fingers rest (a hundred
-sweeps) and to settle."""
+"""Durations of grasps at a fifth of the usual rate: longer, as the daemon needs a hundred sweeps to
+learn where the fingers rest, and more to settle."""
 PATIENCE_S: Final = 600.0
-"""For what takes a second on a computer that is not emulated, nor busy."""
+"""Longest wait, s, for what takes a second on an idle computer without emulation."""
 LOOK_S: Final = 0.5
 
 
 class StepError(Exception):
-    """Something inside is not as it must be; the message says what."""
+    """A step failed: something inside the machine is wrong; the message says what."""
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What a step saw."""
+    """Result of a step that succeeded."""
 
     what: str
-    """One line."""
+    """What the step saw, in one line."""
     recovery_s: float | None = None
-    """From the deed to the first message that is well again, by the machine's clock."""
+    """Time from the fault to the first sound message, s, by the machine's clock; None: no fault."""
 
 
 class Lab:
-    """The machine, and what may be asked of it."""
+    """The machine, and calls for the steps: commands inside, the journal, messages of the hands."""
 
     def __init__(self, machine: Machine, bridge: Bridge) -> None:
         self.machine = machine
         self.bridge = bridge
         self.deeds_s: dict[str, float] = {}
-        """When a step did what a later step awaits, by the machine's monotonic clock."""
+        """Times of what a step did and a later step awaits, by the machine's monotonic clock."""
 
     def sh(self, script: str, timeout_s: float = COMMAND_TIMEOUT_S) -> str:
-        """What a script prints, without the last line's end. Raises `StepError` if it fails."""
+        """Run a shell script inside; return its output without the last line's end.
+
+        Raises `StepError` if it fails.
+        """
         done = self.machine.run(script, timeout_s)
         if done.code:
             said = (done.err or done.out).strip()[-2000:]
@@ -66,27 +69,27 @@ class Lab:
         return done.out.rstrip("\n")
 
     def deed(self, script: str) -> float:
-        """Run a script; when it began, by the machine's monotonic clock, s."""
+        """Run a shell script inside; return when it began, s, by the machine's monotonic clock."""
         return float(self.sh(f"read now _ < /proc/uptime; echo $now\n{script}").split()[0])
 
     def done_s(self, what: str) -> float:
-        """When an earlier step did something. Raises `StepError` if it did not."""
+        """Return the time of `deeds_s` of an earlier step. Raises `StepError` if there is none."""
         if what not in self.deeds_s:
             raise StepError(f"{what}: the step that does it did not come so far")
         return self.deeds_s[what]
 
     def now_s(self) -> float:
-        """The machine's monotonic clock, s."""
+        """Return the time of the machine's monotonic clock, s."""
         return self.deed(":")
 
     def show(self, hand: str, what: str) -> str:
-        """A property of a hand's unit, as systemd has it."""
+        """Return the property `what` of a hand's unit, as `systemctl show` prints it."""
         return self.sh(f"systemctl show --value -p {what} graspd@{hand}")
 
     def journal(self, hand: str, after_s: float, priority: str = "debug") -> list[str]:
-        """Messages of a hand's unit, of a priority at least, since a time of the machine's clock.
+        """Return journal lines of a hand's unit after `after_s`, of at least this priority.
 
-        By the monotonic clock: the wall clock is stepped, and a cursor skips the first match.
+        Times are monotonic, as the wall clock is stepped; a cursor would skip the first match.
         """
         said = self.sh(
             "journalctl -q -b --no-pager -o json --output-fields=MESSAGE "
@@ -100,12 +103,12 @@ class Lab:
         ]
 
     def warnings(self, hand: str, after_s: float) -> list[str]:
-        """Warnings of a hand's unit since a time, without those of an overloaded processor."""
+        """Return a hand's warnings after `after_s`, without those of an overloaded processor."""
         said = self.journal(hand, after_s, "warning")
         return [line for line in said if not line.startswith("overloaded: ")]
 
     def await_journal(self, hand: str, after_s: float, text: str) -> None:
-        """Wait until a hand's unit says something. Raises `StepError` if it does not."""
+        """Wait until a hand's journal has a line with `text`. Raises `StepError` without one."""
         deadline_s = time.monotonic() + PATIENCE_S
         while not any(text in line for line in self.journal(hand, after_s)):
             if time.monotonic() > deadline_s:
@@ -120,7 +123,10 @@ class Lab:
         wanted: Callable[[Message], bool] | None = None,
         timeout_s: float = PATIENCE_S,
     ) -> Message:
-        """The first message of a hand after a time that fits. Raises `StepError` if none."""
+        """Return the first message of a hand after `after_s` for which `wanted` is True.
+
+        None: a verdict on a reading. `what`: its name in the `StepError` if none comes in time.
+        """
 
         def fits(message: Message) -> bool:
             return message.hand == hand and (message.told if wanted is None else wanted(message))
@@ -133,7 +139,10 @@ class Lab:
     def await_true(
         self, script: str, what: str, timeout_s: float = PATIENCE_S, look_s: float = LOOK_S
     ) -> None:
-        """Wait until a script succeeds. Raises `StepError` if it never does."""
+        """Run a shell script every `look_s` until it succeeds. Raises `StepError` if it never does.
+
+        `what`: words for the error.
+        """
         deadline_s = time.monotonic() + timeout_s
         while self.machine.run(script).code:
             if time.monotonic() > deadline_s:
@@ -141,14 +150,17 @@ class Lab:
             time.sleep(look_s)
 
     def last(self, hand: str, kind: str) -> dict[str, Any]:
-        """The newest message of a hand and kind. Raises `StepError` if there is none."""
+        """Return the body of a hand's newest message of a kind. Raises `StepError` without one."""
         message = self.machine.messages.last(hand, kind)
         if message is None:
             raise StepError(f"{hand}: no {kind} has come")
         return message.body
 
     def verdicts(self, hand: str, from_s: float, to_s: float) -> list[Message]:
-        """All verdicts of a hand in a time. Raises `StepError` if one was."""
+        """Return all verdicts of a hand from `from_s` to `to_s`.
+
+        Raises `StepError` if one was lost, or the daemon restarted meanwhile.
+        """
         found = self.machine.messages.between(hand, "verdict", from_s, to_s)
         for former, following in itertools.pairwise(found):
             if former.body["boot_id"] != following.body["boot_id"]:
@@ -158,7 +170,7 @@ class Lab:
         return found
 
     def observe(self) -> None:
-        """Have a member of the group subscribe to both hands."""
+        """Start observe.py inside, as a member of the group, for both hands."""
         endpoints = " ".join(f"ipc:///run/graspd/{hand}.ipc" for hand in HANDS)
         self.sh(
             f"systemd-run -q --unit=observer --uid={MEMBER} "
@@ -167,10 +179,7 @@ class Lab:
         )
 
     def twin(self) -> None:
-        """Start the CAN board's twin on vcan0.
-
-        It plays a recording, which costs it less than to make up grasps.
-        """
+        """Start the CAN board's twin on vcan0; it plays a recording, as making grasps is slower."""
         self.sh(
             "systemd-run -q --unit=twin-can /usr/local/bin/graspd twin can "
             f"--interface socketcan --channel vcan0 --rate {RATE_HZ} "
@@ -178,18 +187,18 @@ class Lab:
         )
 
     def await_new_reading(self, hand: str) -> None:
-        """Wait for a verdict on a reading that is made from now on."""
+        """Wait for a verdict on a reading that is made after this call."""
         now_s = self.now_s()
         self.await_message(hand, now_s, "a verdict", lambda m: m.told and m.made_s > now_s)
 
     def interface(self) -> dict[str, int]:
-        """Frames that the kernel has carried on vcan0, by its own counters."""
+        """Return how many frames the kernel has `sent` and `dropped` on vcan0."""
         told = json.loads(self.sh("ip -s -j link show vcan0"))[0]["stats64"]
         return {"sent": told["tx"]["packets"], "dropped": told["tx"]["dropped"]}
 
 
 class Bridge:
-    """An SPI bridge's twin on a terminal of the host, which the machine has as a USB adapter."""
+    """An SPI bridge's twin on a terminal of the host; the machine sees it as a USB adapter."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -199,7 +208,7 @@ class Bridge:
 
     @contextlib.contextmanager
     def serving(self) -> Iterator[None]:
-        """Serve in a thread of its own."""
+        """Run the twin in a thread during the block."""
         with self._twin, at_work(self._serve):
             yield
 

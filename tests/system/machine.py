@@ -1,4 +1,4 @@
-"""One machine in QEMU, by software emulation: starts it, runs commands inside, pulls its cables."""
+"""A machine emulated by QEMU: starts it, runs commands inside, unplugs its USB adapter."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ MEMORY_MIB: Final = 1536
 CPUS: Final = 2
 START_TIMEOUT_S: Final = 60.0
 BOOT_TIMEOUT_S: Final = 900.0
-"""18 s where the host is idle, 220 s where its tests leave it a tenth of a processor."""
+"""Longest boot, s. It takes 18 s on an idle host, 220 s with a tenth of a processor."""
 CONSOLE_BYTES: Final = 2000
-"""Most of the console in an error, bytes."""
+"""Bytes of the console's end that an error shows at most."""
 ANSWER_TIMEOUT_S: Final = 200.0
-"""For a guest agent that is busy, under emulation."""
+"""Longest wait, s, for an answer of QEMU or of the guest agent, which may be busy."""
 COMMAND_TIMEOUT_S: Final = 600.0
 SYNCHRONISE_S: Final = 5.0
-"""After this long the agent is asked again: while it starts it loses what it was asked."""
+"""Time after which the agent is asked again, s: while it starts it loses requests."""
 POLL_S: Final = (0.05, 0.1, 0.2, 0.5)
-"""Waits between looks at whether a command has ended; the last one again and again."""
+"""Waits before the first checks that a command has ended, s; the last one repeats."""
 AGENT_PORT: Final = "org.qemu.guest_agent.0"
 KERNEL_OPTIONS: Final = "mitigations=off no_timer_check"
-"""On a busy host the emulated timer may miss its test, whereupon the kernel panics."""
+"""Options of the kernel: without its test of the timer, which may fail on a busy host."""
 MESSAGE_PORT: Final = "graspd.messages"
 """Name of the virtio port to which the guest writes what its subscriber receives."""
 ENVIRONMENT: Final = (
@@ -47,7 +47,7 @@ ENVIRONMENT: Final = (
 
 
 class MachineError(Exception):
-    """The machine does not do what every machine does: boot, run a command, answer in time."""
+    """The machine did not boot, run a command or answer in time; the message says what."""
 
 
 class ProtocolError(Exception):
@@ -58,7 +58,7 @@ class JsonLines:
     """Requests and answers as JSON, one per line, over a Unix socket: QMP and the guest agent."""
 
     def __init__(self, path: Path, timeout_s: float) -> None:
-        """Connect, with patience. Raises `ProtocolError`."""
+        """Connect to the socket, retrying for `timeout_s`. Raises `ProtocolError` if it cannot."""
         self._name = path.name
         self._rest = b""
         deadline_s = time.monotonic() + timeout_s
@@ -75,11 +75,11 @@ class JsonLines:
                 return
 
     def close(self) -> None:
-        """Hang up."""
+        """Close the connection."""
         self._socket.close()
 
     def request(self, execute: str, timeout_s: float, **arguments: object) -> Any:  # noqa: ANN401
-        """What is answered to a request. Raises `ProtocolError`."""
+        """Send a request, and return the value of the answer. Raises `ProtocolError`."""
         message = {"execute": execute, "arguments": arguments}
         try:
             self._socket.sendall(json.dumps(message).encode() + b"\n")
@@ -94,7 +94,7 @@ class JsonLines:
                 return answer["return"]
 
     def receive(self, deadline_s: float) -> dict[str, Any]:
-        """The next object, by the monotonic clock's `deadline_s`. Raises `ProtocolError`."""
+        """Return the next JSON object. Raises `ProtocolError` if none comes by `deadline_s`."""
         while b"\n" not in self._rest:
             self._socket.settimeout(max(deadline_s - time.monotonic(), 0.001))
             try:
@@ -115,7 +115,7 @@ class JsonLines:
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """A command that has ended."""
+    """Result of a command that has ended."""
 
     code: int
     """Exit code; 128 and the signal's number if a signal ended it."""
@@ -124,20 +124,18 @@ class Done:
 
 
 class Machine:
-    """Runs from `with` to its end; what it writes to its disk is forgotten."""
+    """Runs during its `with` block; changes to its disk are discarded."""
 
     def __init__(self, image: Image, payload: Path, serial: Path, folder: Path) -> None:
-        """`payload`: a second disk. `serial`: a terminal of the host, the USB adapter's other end.
-
-        `folder` takes sockets and the console's log.
-        """
+        """`payload`: image of a second disk. `serial`: terminal of the host, where the USB adapter
+        leads. `folder`: for sockets and the console's log."""
         self.messages = Messages()
         self.console = folder / "console.log"
         self._image, self._payload, self._serial = image, payload, serial
         self._folder = folder
         self._number = 0
         self._in_step = False
-        """Whether the agent has answered all that it was asked; else a late answer may come."""
+        """True if the agent has answered all requests; False: a late answer may still come."""
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
@@ -169,7 +167,7 @@ class Machine:
         self._stack.close()
 
     def wait_for_agent(self) -> None:
-        """Wait until commands can be run. Raises `MachineError`."""
+        """Wait until commands can be run. Raises `MachineError` if the machine does not boot."""
         deadline_s = time.monotonic() + BOOT_TIMEOUT_S
         while time.monotonic() < deadline_s:
             with contextlib.suppress(ProtocolError):
@@ -182,7 +180,7 @@ class Machine:
         )
 
     def _synchronise(self) -> None:
-        """Ask the agent for a number, and read until it comes: what comes before is stale."""
+        """Have the agent repeat a number, and drop the answers before it, which are stale."""
         self._number += 1
         deadline_s = time.monotonic() + SYNCHRONISE_S
         answer = self._agent.request("guest-sync", SYNCHRONISE_S, id=self._number)
@@ -220,7 +218,7 @@ class Machine:
         )
 
     def _begin(self, script: str) -> int:
-        """Begin a shell script; its process id inside."""
+        """Begin a shell script inside; return its process id there."""
         if not self._in_step:
             self.wait_for_agent()
         started = self._ask(

@@ -1,4 +1,4 @@
-"""What a subscriber inside receives, with the times of arrival by the machine's clock."""
+"""Messages that a subscriber inside receives, with their arrival by the machine's clock."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.threads import at_work
 
 RECEIVE_BYTES: Final = 65536
 LOOK_S: Final = 0.2
-"""How soon the listening thread notices that it shall end."""
+"""Time between the listening thread's checks that it must end, s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +25,7 @@ class Message:
     """One message of a daemon."""
 
     t_s: float
-    """When it came, by the machine's monotonic clock."""
+    """Time of arrival, s, by the machine's monotonic clock."""
     kind: str
     """`verdict`, `gate` or `status`."""
     hand: str
@@ -33,12 +33,12 @@ class Message:
 
     @property
     def made_s(self) -> float:
-        """When its reading was made or it was sent, by the same clock: before `t_s`."""
+        """Time of its reading, or of sending if it has none, s, by the same clock as `t_s`."""
         return float(self.body["t_mono_ns"]) / 1e9
 
     @property
     def told(self) -> bool:
-        """Whether it is a verdict on a reading, and none that says that nothing came."""
+        """True for a verdict on a reading, False for one that no reading came, and other kinds."""
         return self.kind == "verdict" and self.body["still_ms"] is not None
 
 
@@ -54,7 +54,7 @@ class Messages:
 
     @contextlib.contextmanager
     def listening(self, path: Path) -> Iterator[None]:
-        """Listen on the Unix socket where the machine's port ends."""
+        """Collect messages during the block, from the Unix socket of the machine's port."""
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as port:
             port.connect(str(path))
             port.settimeout(LOOK_S)
@@ -62,7 +62,8 @@ class Messages:
                 yield
 
     def wait(self, wanted: Wanted, timeout_s: float, after_s: float = 0.0) -> Message | None:
-        """The first that fits and came later than `after_s`; None if none came in time."""
+        """Return the first message after `after_s` for which `wanted` is True, None if none comes
+        in `timeout_s`; searches earlier messages too."""
         deadline_s = time.monotonic() + timeout_s
         at = 0
         with self._changed:
@@ -75,13 +76,13 @@ class Messages:
                     return None
 
     def between(self, hand: str, kind: str, from_s: float, to_s: float) -> list[Message]:
-        """Messages of a hand and kind that came in this time."""
+        """Return the messages of a hand and kind that came after `from_s`, up to `to_s`."""
         with self._changed:
             found = list(self._all)
         return [m for m in found if (m.hand, m.kind) == (hand, kind) and from_s < m.t_s <= to_s]
 
     def last(self, hand: str, kind: str) -> Message | None:
-        """The newest of a hand and kind."""
+        """Return the newest message of a hand and kind; None if there is none."""
         return next(reversed(self.between(hand, kind, 0.0, float("inf"))), None)
 
     def _listen(self, port: socket.socket, stop: threading.Event) -> None:

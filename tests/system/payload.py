@@ -20,23 +20,26 @@ from tests.system.lab import GRASPS, RATE_HZ
 PROJECT: Final = Path(__file__).parents[2]
 GUEST: Final = Path(__file__).parent / "guest"
 GUEST_PYTHON: Final = (3, 11)
-"""Python of the machine's release; wheels are made by this one for that one."""
+"""Version of Python in the machine, and so of the Python that makes its wheels."""
 EXTRA: Final = "record"
-"""The optional part that the scenes need."""
+"""Extra of the package that the scenes need."""
 RECORDED: Final = 6
-"""Grasps of the recording that the CAN board plays."""
+"""Number of grasps in the recording that the CAN board plays."""
 UNUSED: Final = (
     r"numpy/.*/tests/|numpy/(distutils|f2py)/.*/|onnxruntime/(transformers|quantization|tools)/|"
     r"pydantic/v1/"
 )
-"""Files of wheels that graspd never imports, nor what it imports. To unpack and compile them takes
-the machine a third of the installation."""
+"""Pattern of files in wheels that nothing imports. They would take the machine a third of the
+installation's time."""
 SLACK_MIB: Final = 24
-"""What the file system itself takes, and more."""
+"""Space on the disk beyond that of the files, MiB: more than the file system itself takes."""
 
 
 def make_payload(cache: Path, disk: Path) -> None:
-    """Make the disk; wheels of other projects are kept in `cache`. Raises `ImageError`."""
+    """Make the disk's image at `disk`; `cache` keeps wheels of other projects.
+
+    Raises `ImageError`, also with another Python than `GUEST_PYTHON`.
+    """
     if sys.version_info[:2] != GUEST_PYTHON:
         wanted = ".".join(map(str, GUEST_PYTHON))
         raise ImageError(f"the machine has Python {wanted}: run this with Python {wanted}")
@@ -57,14 +60,14 @@ def make_payload(cache: Path, disk: Path) -> None:
 
 
 def write_recording(path: Path) -> None:
-    """Write what the CAN board plays: the same grasps each time."""
+    """Write the recording that the CAN board plays: the same grasps each time."""
     grasps = synthetic_grasps(RECORDED, rate_hz=RATE_HZ, durations=GRASPS)
     with path.open("w") as file:
         write_stream(grasps, file, t_decimals=2)
 
 
 def _dependencies(cache: Path) -> Path:
-    """A folder with the wheels of what the project needs."""
+    """Return a folder in `cache` with the wheels that the project needs; made if missing."""
     project = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]
     wanted = sorted(project["dependencies"] + project["optional-dependencies"][EXTRA])
     digest = hashlib.sha256("\n".join([*wanted, UNUSED]).encode()).hexdigest()[:16]
@@ -87,7 +90,7 @@ def _wheel(folder: Path, *what: str) -> None:
 
 
 def _slim(wheel: Path) -> None:
-    """Write a wheel again without `UNUSED`; pip does not mind files that are only listed."""
+    """Rewrite a wheel without `UNUSED`; pip accepts files that are listed and missing."""
     with zipfile.ZipFile(wheel) as content:
         files = {each: content.read(each) for each in content.namelist()}
     with zipfile.ZipFile(wheel, "w") as content:

@@ -1,4 +1,4 @@
-"""Steps of the system test: what breaks, and how soon all is well again."""
+"""Steps of the system test: faults, and the time until verdicts come again."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from tests.system.messages import Message
 from tests.system.steps_verdicts import judgement
 
 OUTAGE_S: Final = 2.0
-"""How long a cable stays unplugged."""
+"""Time for which a link is down, s."""
 WATCHED_S: Final = 1.0
-"""How long nothing may happen after something that must not matter."""
+"""Time after a step of the clock in which it must have no effect, s."""
 STALE_S: Final = 5.0
-"""Age at which a reading is stale: `max_age_ms` of both scenes."""
+"""Age at which a reading is stale, s: `max_age_ms` of both scenes."""
 DAY_S: Final = 86_400
 STEPS: Final = ("+", "-", "+", "-")
-"""Signs of the clock's steps of a day. A busy host that stands still may cost the link once, with a
-warning; a step that is noticed brings one each time."""
+"""Signs of the wall clock's steps of a day, each twice: a busy host may cause a warning by itself,
+but a step that the daemon notices would cause one each time."""
 FILLER: Final = "/filler"
 FILL: Final = f"""
 for size in 64M 1M 64K 4K; do
@@ -27,7 +27,7 @@ for size in 64M 1M 64K 4K; do
 done
 cat /proc/cpuinfo > {FILLER}.last 2>/dev/null && exit 1
 :"""
-"""Shell: fill the disk to the last block, without writing; fails if a file still fits."""
+"""Shell script that fills the disk to the last block, by allocation; fails if a file still fits."""
 REPLAY_TIMEOUT_S: Final = 600.0
 NO_SPACE: Final = "No space left on device"
 CANNOT_KEEP: Final = f"cannot keep the session: {NO_SPACE}"
@@ -37,20 +37,20 @@ SESSION: Final = "/var/lib/graspd/serial.session/*.session"
 
 
 def killed(lab: Lab) -> Outcome:
-    """kill -9: systemd starts it again, a subscriber need not do anything."""
+    """Kill the CAN hand's daemon: systemd restarts it, and a subscriber receives it again."""
     at_s = lab.deed(f"kill -KILL {lab.show('can', 'MainPID')}")
     recovery_s = _started_anew(lab, "can", at_s, "signal")
     return Outcome("kill -9 -> first verdict of the new process", recovery_s)
 
 
 def hangs(lab: Lab) -> Outcome:
-    """SIGSTOP; while the watchdog waits, the steps before `hung` try the other hand."""
+    """Stop the serial hand's daemon by SIGSTOP; other steps run until `hung` sees the result."""
     lab.deeds_s["SIGSTOP"] = lab.deed(f"kill -STOP {lab.show('serial', 'MainPID')}")
     return Outcome("SIGSTOP to the serial hand")
 
 
 def hung(lab: Lab) -> Outcome:
-    """After SIGSTOP the watchdog notices and systemd starts it again."""
+    """Wait until the watchdog has noticed the daemon of `hangs`, and systemd has restarted it."""
     recovery_s = _started_anew(lab, "serial", lab.done_s("SIGSTOP"), "watchdog")
     limit = lab.show("serial", "WatchdogUSec")
     what = f"SIGSTOP -> watchdog ({limit} here) -> first verdict of the new process"
@@ -58,7 +58,10 @@ def hung(lab: Lab) -> Outcome:
 
 
 def _started_anew(lab: Lab, hand: str, at_s: float, result: str) -> float:
-    """Wait for the process after the one that ended at `at_s`; return the time to its verdict."""
+    """Wait for a verdict of a new daemon after the fault at `at_s`; return the time between, s.
+
+    `result`: systemd's result of the former process.
+    """
     # By a verdict: the last status may be that of a process before.
     former = lab.machine.messages.between(hand, "verdict", 0.0, at_s)[-1].body["boot_id"]
     well = lab.await_message(
@@ -69,7 +72,7 @@ def _started_anew(lab: Lab, hand: str, at_s: float, result: str) -> float:
 
 
 def bus_down(lab: Lab) -> Outcome:
-    """The CAN interface goes down and comes back: unknown meanwhile, then verdicts, no restart."""
+    """Take the CAN interface down and up: verdicts are unknown, then come again, no restart."""
     pid = lab.show("can", "MainPID")
     down_s = lab.deed("ip link set vcan0 down")
     said = lab.await_message("can", down_s, "unknown", _unknown)
@@ -82,7 +85,7 @@ def bus_down(lab: Lab) -> Outcome:
 
 
 def unplugged(lab: Lab) -> Outcome:
-    """The USB serial adapter is pulled and put back: the driver finds it by its stable name."""
+    """Unplug and plug the USB serial adapter: the driver finds it again by its stable name."""
     pid = lab.show("serial", "MainPID")
     out_s = lab.now_s()
     lab.machine.unplug()
@@ -115,7 +118,7 @@ def _same_process(lab: Lab, hand: str, pid: str) -> None:
 
 
 def disk_full(lab: Lab) -> Outcome:
-    """The disk is full: judging continues, a warning each says what cannot be kept."""
+    """Fill the disk: judging continues, one warning each for the session and the recording."""
     pid = lab.show("serial", "MainPID")
     try:
         full_s = lab.deed(FILL)
@@ -147,7 +150,7 @@ def disk_full(lab: Lab) -> Outcome:
 
 
 def recording_again(lab: Lab) -> Outcome:
-    """What a full disk ended, the recorder begins again by itself."""
+    """Wait until the recorder that a full disk ended begins a recording again by itself."""
     free_s = lab.done_s("room")
     again = lab.await_message("serial", free_s, "a recording again", _recording)
     lab.verdicts("serial", free_s, again.t_s)
@@ -159,7 +162,7 @@ def _recording(message: Message) -> bool:
 
 
 def clock_stepped(lab: Lab) -> Outcome:
-    """The wall clock jumps by a day, there and back: nothing inside may notice."""
+    """Step the wall clock by a day and back: no verdict is stale or lost, and no hand warns."""
     compared = 0
     warned: Counter[tuple[str, str]] = Counter()
     for sign in STEPS:
@@ -180,15 +183,15 @@ def clock_stepped(lab: Lab) -> Outcome:
 
 
 def _stale_too_early(message: Message) -> bool:
-    """True if the reading is called stale though by the monotonic clock it is not.
+    """True if the verdict has the reason `stale`, but by the monotonic clock is not that old.
 
-    A busy host may stall for longer: what is stale then has nothing to do with the wall clock.
+    A busy host may stall and make readings truly stale, which is not a fault.
     """
     return "stale" in message.body["reasons"] and message.t_s - message.made_s < STALE_S
 
 
 def stopped(lab: Lab) -> Outcome:
-    """systemctl stop: a last status, exit code 0."""
+    """Stop the CAN hand by systemctl: it sends a last status and exits with code 0."""
     lab.sh("systemctl -q enable graspd@can")  # else systemd forgets how it ended
     at_s = lab.deed("systemctl stop graspd@can")
     ended_s = int(lab.show("can", "ExecMainExitTimestampMonotonic")) / 1e6 - at_s
@@ -205,7 +208,7 @@ def _stopping(message: Message) -> bool:
 
 
 def wrong_start(lab: Lab) -> Outcome:
-    """A wrong scene fails with exit code 2, once, and is not tried again."""
+    """Start a hand with a wrong scene: it fails with exit code 2, and systemd does not retry."""
     lab.sh("echo '[tactile]' > /etc/graspd/wrong.toml")
     if lab.machine.run("systemctl start graspd@wrong", PATIENCE_S).code == 0:
         raise StepError("a wrong scene starts")

@@ -1,4 +1,4 @@
-"""Steps of the system test: install, look at what was installed, remove it again."""
+"""Steps of the system test: install the service, check the installation, remove it again."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ OFFLINE: Final = f"{INSTALL} --wheelhouse {PAYLOAD}/wheels --extras {EXTRA}"
 INSTALL_TIMEOUT_S: Final = 900.0
 DOCTOR_TIMEOUT_S: Final = 600.0
 LISTEN_S: Final = 5.0
-"""Long enough for the doctor to hear the bridge on an emulated processor that is busy."""
+"""Time for which the doctor listens to the bridge, s: enough on a busy emulated processor."""
 
 
 def prepare(lab: Lab) -> Outcome:
-    """The machine is up; give it disk, users and a CAN bus."""
+    """Wait for the end of the boot, mount the payload, and make a virtual CAN bus."""
     state = lab.sh("systemctl is-system-running --wait")
     lab.sh(f"mkdir {PAYLOAD} && mount -o ro /dev/vdb {PAYLOAD}")
     # The disk will be filled: the journal must not live on it.
@@ -37,7 +37,7 @@ def prepare(lab: Lab) -> Outcome:
 
 
 def install(lab: Lab) -> Outcome:
-    """Offline, from wheels alone."""
+    """Install graspd offline from wheels, and add users, scenes and settings for emulation."""
     lab.sh(OFFLINE, INSTALL_TIMEOUT_S)
     lab.sh(f"useradd -G graspd {MEMBER} && useradd {STRANGER}")
     scenes = " ".join(f"{PAYLOAD}/guest/{hand}.toml" for hand in HANDS)
@@ -50,7 +50,7 @@ def install(lab: Lab) -> Outcome:
 
 
 def doctor(lab: Lab) -> Outcome:
-    """The doctor sees the bridge behind the USB adapter."""
+    """Run the doctor: it finds the bridge behind the USB adapter, and nothing wrong."""
     command = f"graspd doctor --listen {LISTEN_S:g} /etc/graspd/serial.toml"
     done = lab.machine.run(command, DOCTOR_TIMEOUT_S)
     if done.code or "link up" not in done.out:
@@ -59,7 +59,7 @@ def doctor(lab: Lab) -> Outcome:
 
 
 def start(lab: Lab) -> Outcome:
-    """Both hands at once; systemd waits for READY."""
+    """Start both hands at once, wait for READY and first messages, then start the CAN twin."""
     began_s = lab.deed("systemctl start " + " ".join(f"graspd@{hand}" for hand in HANDS))
     ready_s = []
     for hand in HANDS:
@@ -75,7 +75,7 @@ def start(lab: Lab) -> Outcome:
 
 
 def realtime(lab: Lab) -> Outcome:
-    """The scene's [realtime] is granted by the unit, and nothing is missing."""
+    """Check that the unit grants the scene's [realtime] (SCHED_FIFO, locked memory) unwarned."""
     pid = lab.show("can", "MainPID")
     policy = lab.sh(f"ps -o cls=,rtprio= -p {pid}").split()
     locked_kib = int(lab.sh(f"sed -n 's/^VmLck:[^0-9]*\\([0-9]*\\).*/\\1/p' /proc/{pid}/status"))
@@ -88,7 +88,7 @@ def realtime(lab: Lab) -> Outcome:
 
 
 def access(lab: Lab) -> Outcome:
-    """Members of the group may connect, others not."""
+    """Check that members of the group graspd may connect to the socket, and others may not."""
     connect = "import socket, sys; socket.socket(socket.AF_UNIX).connect(sys.argv[1])"
     for user, error in ((MEMBER, ""), (STRANGER, "PermissionError")):
         done = lab.machine.run(f"runuser -u {user} -- {PYTHON} -c '{connect}' /run/graspd/can.ipc")
@@ -98,7 +98,7 @@ def access(lab: Lab) -> Outcome:
 
 
 def enabled(lab: Lab) -> Outcome:
-    """The target that a boot reaches starts an enabled hand."""
+    """Enable a hand, and check that multi-user.target, as at boot, starts it."""
     lab.sh(f"{OFFLINE} --enable serial", INSTALL_TIMEOUT_S)
     lab.sh("systemctl stop graspd@serial")
     at_s = lab.deed("systemctl start multi-user.target")
@@ -108,7 +108,7 @@ def enabled(lab: Lab) -> Outcome:
 
 
 def uninstall(lab: Lab) -> Outcome:
-    """Nothing is left, except what belongs to the user; with --purge not even that."""
+    """Uninstall: only scenes and learned data are left; with --purge nothing is."""
     lab.sh("rm -r /etc/systemd/system/graspd@.service.d; systemctl stop observer")
     lab.sh(f"{INSTALL} --uninstall")
     find = "find / -xdev -iname '*graspd*' ! -path '/proc/*' ! -path '/sys/*' | sort"

@@ -1,4 +1,4 @@
-"""Steps of the system test: what comes out is what was put in, and nothing is lost on the way."""
+"""Steps of the system test: verdicts on known grasps over both links, and no loss of frames."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from tests.system.messages import Message
 from tests.system.payload import write_recording
 
 P_SLIP_ERROR_MAX: Final = 0.05
-"""Emulation stalls, so a grasp may settle some sweeps later than in a replay: by noise alone its
-`p_slip` is up to 0.03 another then."""
+"""Largest difference of `p_slip` from a replay's: under emulation a grasp may settle some sweeps
+later, and noise then changes `p_slip` by up to 0.03."""
 CAN_MODEL: Final = "small-electrodes"
 """Model that `can.toml` names."""
 GRASPS: Final = 3
 
 
 def can_verdicts(lab: Lab) -> Outcome:
-    """Grasps that came over CAN so far have the verdicts of a replay, and no frame was lost."""
+    """Check that the first grasps over CAN have a replay's verdicts, and no frame was lost."""
     expected = _replayed()
     after_s = 0.0
     judged: list[float] = []
@@ -47,7 +47,7 @@ def can_verdicts(lab: Lab) -> Outcome:
 
 
 def _replayed() -> list[float]:
-    """Replay the recording on the host; return p_slip of its grasps."""
+    """Replay the recording on the host; return `p_slip` of its grasps. Raises `StepError`."""
     with tempfile.TemporaryDirectory() as folder:
         recording = Path(folder) / "recording.csv"
         write_recording(recording)
@@ -65,9 +65,9 @@ def _replayed() -> list[float]:
 
 
 def serial_verdicts(lab: Lab) -> Outcome:
-    """Whole grasps over the serial port: each is judged once, when it has settled.
+    """Wait until grasps over the serial port since the start are judged, one of them validly.
 
-    From the start on: they are made all the time.
+    The outcome says how often each was judged.
     """
     began_s = after_s = 0.0
     lab.await_message("serial", began_s, "rest learned", _tared)
@@ -93,7 +93,7 @@ def _tared(message: Message) -> bool:
 
 
 def judgement(message: Message) -> bool:
-    """Whether it is the verdict of a grasp that has just been judged."""
+    """True if the message is the verdict by which a grasp is judged."""
     return message.told and bool(message.body["judged"])
 
 

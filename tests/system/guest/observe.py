@@ -1,4 +1,4 @@
-"""Runs inside: subscribes, and writes every message with the time of its arrival to stdout."""
+"""Runs inside the machine: writes each message of the daemons, with its arrival, to stdout."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import time
 import zmq
 
 RECONNECT_MS = 50
-"""How often to try a socket that is gone, ms: part of every recovery that is measured."""
+"""Time between attempts to reconnect, ms: part of each recovery time that is measured."""
 
 
 def main(endpoints: list[str]) -> None:
-    """Never ends."""
+    """Subscribe to the endpoints, and write their messages as JSON lines; never ends."""
     subscriber = zmq.Context().socket(zmq.SUB)
     subscriber.reconnect_ivl = RECONNECT_MS
     for endpoint in endpoints:
