@@ -15,13 +15,14 @@ KINDS: Final[Mapping[str, ModuleType]] = {
     "messages": messages,
     "commands": commands,
 }
-"""Each has `NAMES` of references, `path_of` and `made`, which take a name, and `differences`."""
+"""Module of each kind of references, with `NAMES` and functions `path_of(name)`, `made(name)` and
+`differences(before, now)`."""
 SHOWN_MAX: Final = 5
-"""Differences that are told; the rest only as a number."""
+"""Most differences of a reference that are printed; all are counted."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Compare with the references, or renew them; 1 if something differs."""
+    """Compare with the references, or renew them; return 1 if one differs and is not renewed."""
     parser = argparse.ArgumentParser(
         prog="python -m tests.process_replay",
         description="Compare with the references, or renew them.",
@@ -45,7 +46,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def renewed(kind: ModuleType, before: str, now: str) -> list[str]:
-    """Return the lines of `now`, as they were where only last digits differ."""
+    """Return the lines of `now`, but those of `before` that differ only within the tolerance.
+
+    If their numbers differ, all lines of `now`.
+    """
     was, lines = before.splitlines(keepends=True), now.splitlines(keepends=True)
     if len(was) != len(lines):
         return lines

@@ -1,4 +1,4 @@
-"""What the commands say: stdout, stderr and exit code, `references/commands/<name>.txt`.
+"""References of the commands: stdout, stderr and exit code, `references/commands/<name>.txt`.
 
 Each runs in this process, in a folder of its own with the files that `_prepare` makes.
 """
@@ -27,9 +27,9 @@ from tests.process_replay.streams import CHECKOUT, demo
 
 FOLDER: Final = CHECKOUT / "tests" / "references" / "commands"
 LONG: Final = 12_000
-"""Outputs with more characters are kept as a checksum; other tests hold these texts."""
+"""Most characters of an output that is kept as text; a longer one is kept as a checksum."""
 TOLERANCE: Final = 1.1e-3
-"""Largest difference of numbers with a point: commands show three digits of `p_slip`."""
+"""Largest difference of numbers with a point, absolute or relative: `p_slip` has three digits."""
 
 COMMANDS: Final[Mapping[str, str]] = {
     "none": "",
@@ -134,11 +134,14 @@ _MASKS: Final = (
 
 
 NUMBER: Final = re.compile(r"(?<=[\[:, ])-?\d+(?:\.\d+(?:e[-+]?\d+)?|e[-+]?\d+)(?=[\],} \n]|$)")
-"""A number with a point or exponent. Others are counted and must be equal."""
+"""Pattern of a number with a point or exponent, which may differ a little; others must be equal."""
 
 
 def execute(arguments: Sequence[str], folder: Path) -> CompletedProcess[str]:
-    """Run a command in this process and folder, its home, with help texts of a fixed width."""
+    """Run a graspd command in this process, with `folder` as working and home folder.
+
+    Help texts have a fixed width.
+    """
     with contextlib.chdir(folder), pytest.MonkeyPatch.context() as patched:
         patched.setenv("COLUMNS", "80")
         patched.setenv("HOME", str(folder))
@@ -168,7 +171,7 @@ def _all() -> dict[str, str]:
 
 
 def _prepare(folder: Path) -> None:
-    """Make the files that the commands are given."""
+    """Make the files in `folder` that the commands use: recordings, tables, scenes, keys."""
     for name, source, rows in (
         ("stream.csv", DEMO_RECORDING, 700),
         ("table.csv", DEMO_TABLE, 60),
@@ -207,7 +210,8 @@ def differences(before: str, now: str) -> list[str]:
 
 
 def lines_apart(before: Sequence[str], now: Sequence[str], tolerance: float) -> list[str]:
-    """Return where lines differ. Numbers with a point may differ by `tolerance`."""
+    """Return where lines differ, as text. Numbers with a point may differ by `tolerance`,
+    absolute or relative."""
     found = [
         f"line {number}: {was}\n  became: {is_now}"
         for number, (was, is_now) in enumerate(zip(before, now, strict=False), start=1)

@@ -1,4 +1,4 @@
-"""One run of the loop over a stream, on a stepped clock: every message that it sends."""
+"""Run the daemon's loop over a stream on a simulated clock, and collect its messages."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from tests.process_replay.streams import FINGERS, START_NS
 
 BOOT_ID: Final = "0123456789abcdef" * 2
 ASKED_EVERY: Final = 40
-"""Verdicts from one question to the next."""
+"""Number of verdicts from one question of the controller to the next."""
 SLOW_NS, SLOW_FOR, SLOW_EVERY = 15_000_000, 260, 600
 """On a slow computer the first 260 verdicts of each 600 take 15 ms. Readings are skipped, for long
 enough to be an overload."""
@@ -40,30 +40,30 @@ STALL_NS, STALL_AT = 160_000_000, 500
 """On a slow computer one verdict of each 600 takes 160 ms. The next readings are too old."""
 
 Message = tuple[str, str]
-"""Kind, such as `verdict`, and payload."""
+"""Kind of a message, such as `verdict`, and its payload."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Case:
-    """A stream, and how it is judged."""
+    """A stream of readings, and the scene and controller with which it is judged."""
 
     readings: Callable[[], Iterator[Reading]]
     sections: Mapping[str, Any] = field(default_factory=dict)
-    """Sections of the scene that are not the usual ones."""
+    """Sections of the scene that are added to the usual ones, or replace them."""
     readings_max: int | None = None
     joints: bool = False
     asks: bool = False
-    """True if the controller asks at fixed readings."""
+    """True if the controller asks for a judgement every `ASKED_EVERY` verdicts."""
     tells: bool = False
-    """True if the controller tells how each lift ended."""
+    """True if the controller lifts each judged grasp, and reports how that ended."""
     slow: bool = False
     """True if judging is slower than the sensors at times, so that readings are skipped."""
 
 
 def run(case: Case, record_in: Path | None = None) -> list[Message]:
-    """Return all messages of a run; record it in a folder if that is given.
+    """Run a case; return all its messages. `record_in`: folder for a recording; None: without.
 
-    This is the only place that builds a loop and its parts.
+    Here alone in process replay a loop and its parts are built.
     """
     clock, wanted = Clock(START_NS), _scene(case)
     model = assembly.load_model(wanted)
@@ -127,7 +127,7 @@ def _scene(case: Case) -> Scene:
 
 
 class _Driver(FakeDriver):
-    """Hands over all readings that are due."""
+    """Driver that hands over all readings that are due by the simulated clock."""
 
     name = "stream"
 
@@ -154,7 +154,7 @@ class _Driver(FakeDriver):
 
 
 class _World(Companion):
-    """The world around the loop: takes messages, asks, tells outcomes, makes the computer slow."""
+    """The loop's surroundings: collects messages, asks, reports outcomes, slows the computer."""
 
     def __init__(self, case: Case, clock: Clock) -> None:
         self.messages: list[Message] = []

@@ -1,7 +1,7 @@
-"""Every byte of the messages of some runs: `references/<name>.messages`.
+"""References of the messages of some runs: `references/<name>.messages`.
 
 A line stands for messages that follow each other and differ in numbers only: how many they are,
-their kind, and the first of them. Kind `answer` is what the loop says to an outcome.
+their kind, and the first of them, without versions. Kind `answer`: the loop's to an outcome.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def made(name: str) -> str:
 
 
 def _frame(message: Message) -> tuple[str, str]:
-    """Return a message without its numbers."""
+    """Return kind and payload of a message with its numbers masked, to group equal ones."""
     kind, payload = message
     return kind, _COUNTER.sub("*", NUMBER.sub("*", payload))
 

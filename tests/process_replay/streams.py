@@ -1,4 +1,4 @@
-"""Streams that are the same every time: recordings, and twins whose bytes go through our parsers.
+"""Streams that repeat exactly: recordings, and twins whose bytes go through the drivers' parsers.
 
 No socket, no port, no sleep: each stream has a clock of its own that moves from reading to reading.
 """
@@ -56,13 +56,13 @@ FAULTS: Final = LinkFaults(
 FRAME_FAULTS: Final = LinkFaults(
     bit_flip_probability=3e-3, drop_probability=3e-3, duplicate_probability=3e-3, seed=7
 )
-"""Damaged, missing and repeated frames, for links that need few frames for a reading."""
+"""Damaged, missing and repeated frames, more often: for links with few frames in each reading."""
 PAUSES: Final = (range(700, 730),)
 """Sweeps during which the SPI bridge is silent: the link is lost and found again."""
 
 
 def recording(path: Path, fingers: Sequence[str] = FINGERS) -> Iterator[Reading]:
-    """Play a CSV recording in its own time, with joints if it has them."""
+    """Yield the readings of a CSV recording at its own times, with joints if it has them."""
     clock = Clock(START_NS)
     with ReplayDriver([path], fingers, clock=clock) as driver:
         while not driver.exhausted:
@@ -71,12 +71,12 @@ def recording(path: Path, fingers: Sequence[str] = FINGERS) -> Iterator[Reading]
 
 
 def demo() -> Iterator[Reading]:
-    """Play the synthetic demo recording, with joints."""
+    """Return the readings of the synthetic demo recording, with joints."""
     return recording(DEMO_RECORDING)
 
 
 def can(log: BinaryIO | None = None) -> Iterator[Reading]:
-    """Play the demo's grasps from a CAN twin; write its frames to `log`, as candump text."""
+    """Yield the demo's readings over a CAN twin; write its frames to `log`, as candump text."""
     clock = Clock(START_NS)
     twin = CanTwin("virtual", "none", _counts(), FINGERS, faults=FAULTS, clock=clock)
     injector = LinkFaultInjector(FAULTS)
@@ -95,7 +95,7 @@ def can(log: BinaryIO | None = None) -> Iterator[Reading]:
 
 
 def palm() -> Iterator[Reading]:
-    """Play the demo's grasps from a palm twin, one packet a millisecond, with calibrated joints."""
+    """Yield the demo's readings over a palm twin, a packet a millisecond, and calibrated joints."""
     calibration = CHECKOUT / "deploy" / "calibration" / "example_hand.toml"
     stream = PalmStream(FINGERS, calibration=calibration)
     t_ns = START_NS
@@ -106,7 +106,7 @@ def palm() -> Iterator[Reading]:
 
 
 def spi(log: BinaryIO | None = None) -> Iterator[Reading]:
-    """Play the demo's grasps from an SPI bridge; write its bytes to `log`, a serial link log."""
+    """Yield the demo's readings over an SPI bridge; write its bytes to `log`, a serial link log."""
     line = _Line(log)
     for sequence, counts in enumerate(_counts()):
         now_ns = START_NS + PERIOD_NS * sequence
@@ -135,7 +135,7 @@ class _Line:
             self._log.write(encode_records(event, t_ns, data))
 
     def say(self, now_ns: int) -> None:
-        """Let the host say what it has to say."""
+        """Send what the host has to send now, open the link if due, and queue the answers."""
         link = self._host.link
         if link.state is LinkState.WAITING and now_ns >= (link.retry_ns or 0):
             self._open(now_ns)
@@ -148,7 +148,7 @@ class _Line:
                     self._answers.append(_hello(message.nonce, now_ns))
 
     def hear(self, now_ns: int, sequence: int, counts: Counts) -> Iterator[Reading]:
-        """Let the bridge answer and send a sweep; yield the readings that the host makes of it."""
+        """Send the bridge's queued answers and a sweep; yield the host's readings of them."""
         words = np.array(
             [[encode_word(int(count)) for count in row] for row in counts.T], dtype=np.uint16
         )[:, [FINGERS.index(finger) for finger in WIRED]]

@@ -1,4 +1,4 @@
-"""Every verdict on every stream: `references/<name>.jsonl`, one line for equal verdicts in a row.
+"""References of all verdicts on each stream: `references/<name>.jsonl`, one line for equal ones.
 
 A line has `n`, how many verdicts it stands for, and the fields that differ from the line before it;
 null means that the field is null or missing again.
@@ -39,13 +39,13 @@ LEFT_OUT: Final = IGNORED_FIELDS | {
     "model",
     "model_sha",
 }
-"""Fields that differ from run to run, and fields that differ at every reading and show in verdict
-and gate."""
+"""Fields that the references lack: they differ from run to run, or at every reading, and these
+show in verdict and gate."""
 RISK: Final = {"risk": {"max_slip_when_stable": 0.3, "warm_up": 4, "explore": 0.3}}
 TWO_FINGERS: Final = ("ff", "th")
 
 Entry = dict[str, Any]
-"""Fields of a verdict, and `n`: how many readings in a row gave it."""
+"""Fields of a verdict, and `n`: number of equal verdicts in a row."""
 
 CASES: Final[Mapping[str, Case]] = {
     "demo": Case(readings=streams.demo, joints=True),
@@ -75,7 +75,7 @@ CASES: Final[Mapping[str, Case]] = {
     ),
     "slow": Case(readings=streams.demo, joints=True, slow=True),
 }
-"""Runs of the loop. Joint readings count too in `readings_max`."""
+"""Runs of the loop by name. `readings_max` counts joint readings too."""
 
 
 def _mcap(folder: Path) -> list[str]:
@@ -109,7 +109,7 @@ REPLAYED: Final[Mapping[str, Callable[[Path], list[str]]]] = {
     "serial_log": _serial_log,
     "can_log": _can_log,
 }
-"""Each makes a recording in a folder and returns the arguments of `graspd replay` for it."""
+"""Functions that make a recording in a folder and return `graspd replay`'s arguments for it."""
 NAMES: Final = (*CASES, *REPLAYED)
 
 
@@ -124,7 +124,7 @@ def played(name: str) -> tuple[Message, ...]:
 
 
 def judged(readings: Iterable[Reading], *, joints: bool) -> list[Entry]:
-    """Return what the default model and gate say of readings; equal verdicts are one entry."""
+    """Return the verdicts of the default model and gate on readings; equal ones are one entry."""
     return entries_of(run(Case(readings=lambda: iter(readings), joints=joints)))
 
 
@@ -145,7 +145,7 @@ def entries_of(messages: Iterable[Message]) -> list[Entry]:
 
 
 def is_near(entry: Entry) -> bool:
-    """Return True if a verdict is too close to call for another processor."""
+    """Return True if `p_slip` is so near the threshold that another processor may differ."""
     p_slip = entry.get("p_slip")
     return p_slip is not None and abs(p_slip - 0.5) < NEAR_THRESHOLD
 
@@ -184,17 +184,17 @@ def parsed(text: str) -> list[Entry]:
 
 
 def reference(name: str) -> list[Entry]:
-    """Return what was judged when the references were renewed."""
+    """Return the entries of a reference, as last renewed."""
     return parsed(path_of(name).read_text())
 
 
 def differences(before: str, now: str) -> list[str]:
-    """Return where two texts of references differ."""
+    """Return where two texts of references differ, one line for each field."""
     return entries_apart(parsed(before), parsed(now))
 
 
 def entries_apart(before: Sequence[Entry], now: Sequence[Entry]) -> list[str]:
-    """Return where two lists of verdicts differ, one line each."""
+    """Return where two lists of verdicts differ, one line for each field."""
     found: list[str] = []
     for number, (was, is_now) in enumerate(zip(before, now, strict=False)):
         found += [
