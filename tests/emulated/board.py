@@ -1,4 +1,4 @@
-"""The bridge's board on an emulated chip, in lock-step, and what is on its sensors' bus."""
+"""The bridge's board on an emulated chip, driven step by step, and events of its sensors' bus."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from tests.emulated.build import EMULATOR, boot_rom, emulator_folder
 
 MS = 1_000_000
 BOARD_ID = "E66118604B2C3A17"
-"""The number of the emulated flash."""
+"""Unique number of the emulated flash, which is the board's id."""
 BOOT_MS = 40
-"""Reset, enumeration and the first look for the sensors take 13 ms."""
+"""Time for reset, USB enumeration and the first search for sensors, ms: they take 13."""
 
 EVENT = np.dtype(
     [("t_ns", "<f8"), ("hz", "<u4"), ("kind", "u1"), ("value", "u1"), ("miso", "u1"), ("", "u1")]
 )
-"""What happened on the bus of the sensors: `kind` SELECT has the mask of those whose chip select is
-low from then on as `value`, `kind` BYTE begins a byte of MOSI and has its clock, Hz."""
+"""An event on the sensors' bus: of `kind` SELECT, `value` is the mask of the sensors whose chip
+select is low from then on; `kind` BYTE begins a byte, with MOSI as `value` and its clock, `hz`."""
 SELECT, BYTE = 0, 1
 Events = NDArray[np.void]
 
@@ -60,9 +60,9 @@ class Status:
 
 
 class Board:
-    """One board: a process of node. Everything happens at the emulated time `now_ns`.
+    """An emulated board, in a process of node. Time stands at `now_ns` between the calls.
 
-    The host's side takes frames as they come into `frames`, and fails on a damaged one.
+    Frames that reach the host are put into `frames`; a damaged one fails the test.
     """
 
     def __init__(self) -> None:
@@ -89,7 +89,7 @@ class Board:
         self._process.wait(10)
 
     def do(self, name: str, /, **arguments: object) -> dict[str, Any]:
-        """One command of `emulator/main.cjs` and its answer."""
+        """Send a command to `emulator/main.cjs`; return its answer, and move `now_ns` on."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.write(json.dumps({"do": name, **arguments}) + "\n")
@@ -104,7 +104,7 @@ class Board:
     # ---- power and cable ----
 
     def power(self, image: Path) -> Self:
-        """Power comes, with an image in the flash; the port is opened as soon as it is there."""
+        """Switch the board on with an image in its flash, open the port, and run `BOOT_MS`."""
         self.do("power", file=str(image))
         self.do("open")
         self.run(BOOT_MS)
@@ -118,7 +118,7 @@ class Board:
     # ---- the line ----
 
     def run_until(self, t_ns: float, *, hand_over: bool = False) -> None:
-        """Let time pass; `hand_over`: no further than until the host gets bytes."""
+        """Run the board up to emulated time `t_ns`; `hand_over`: stop when the host gets bytes."""
         packets = self.do("run", until=t_ns, hand_over=hand_over)["packets"]
         for at_ns, packet in packets:
             *whole, self._held = (self._held + bytes.fromhex(packet)).split(b"\0")
@@ -137,7 +137,7 @@ class Board:
         self.do("send", bytes=b"".join(data).hex())
 
     def hello(self, nonce: int = 99) -> bytes:
-        """Greet the bridge as PROTOCOL.md says."""
+        """Greet the bridge by STOP and PING, as PROTOCOL.md says; return its HELLO's payload."""
         self.send(b"\0", frame(STOP), frame(PING, struct.pack("<I", nonce)))
         self.run(20)
         hellos = [one for one in self.take(HELLO) if struct.unpack_from("<I", one, 5)[0] == nonce]
@@ -145,18 +145,21 @@ class Board:
         return hellos[0]
 
     def start(self) -> None:
-        """Begin sweeping with what stands in row 0 of the counts."""
+        """Send START, with row 0 of the sensors' counts for the first sweep."""
         self.do("rewind")
         self.send(frame(START))
 
     def take(self, kind: int) -> list[bytes]:
-        """Payloads of a type that have come since `take` was last called for it."""
+        """Return the payloads of a type that have come since `take` was last called for it."""
         found = [one.payload for one in self.frames if one.kind == kind]
         self.frames = [one for one in self.frames if one.kind != kind]
         return found
 
     def until(self, kind: int, count: int, within_ms: float) -> list[bytes]:
-        """The first payloads of a type, which must come within an emulated time."""
+        """Run until `count` frames of a type have come; return their payloads.
+
+        Fails if that takes longer than `within_ms` of emulated time.
+        """
         end_ns = self.now_ns + within_ms * MS
         while sum(one.kind == kind for one in self.frames) < count:
             assert self.now_ns < end_ns, f"{len(self.frames)} frames in {within_ms} ms"
@@ -164,7 +167,7 @@ class Board:
         return self.take(kind)[:count]
 
     def status(self) -> Status:
-        """The next STATUS."""
+        """Wait for the next STATUS, and return it."""
         self.take(STATUS)
         return Status.of(self.until(STATUS, 1, 1100.0)[0])
 
@@ -172,7 +175,8 @@ class Board:
 
     @contextmanager
     def recording(self, folder: Path) -> Iterator[Callable[[], Events]]:
-        """What happens on the bus meanwhile, in order, as `EVENT`; called afterwards."""
+        """Record the sensors' bus during the block. Yields a function that returns the events, as
+        `EVENT` in order, once the block has ended."""
         self.do("record")
         events: list[Events] = []
         yield lambda: events[0]
@@ -181,38 +185,41 @@ class Board:
         events.append(np.fromfile(file, EVENT))
 
     def sensor(self, sensor: int, what: str, *values: float) -> None:
-        """`unplug` 0 or 1, `settle` ns, `dead` mask, `force` electrode word; sensors from 0."""
+        """Change a simulated sensor, counted from 0.
+
+        `what` and `values`: `unplug` 0 or 1, `settle` ns, `dead` mask, `force` electrode word.
+        """
         self.do("sensor", sensor=sensor, what=what, values=values)
 
 
 def serials(hello: bytes) -> Iterator[bytes]:
-    """Serial numbers of a HELLO's sensors, without padding."""
+    """Yield the serial numbers of a HELLO's sensors, without padding; empty for a missing one."""
     for start in range(45, 45 + 16 * hello[43], 16):
         yield hello[start : start + 16].rstrip(b"\0")
 
 
 @dataclass
 class Transaction:
-    """From chip select low to high; times in emulated ns."""
+    """A transaction on the bus, from chip select low to high; times in emulated ns."""
 
     sensors: int
-    """Mask of those whose chip select was low."""
+    """Mask of the sensors whose chip select was low."""
     low_ns: float
     high_ns: float = float("inf")
     byte_ns: list[float] = field(default_factory=list)
-    """When the first bit of each byte was clocked."""
+    """Time of each byte's first bit."""
     hz: list[int] = field(default_factory=list)
-    """Clock of each byte."""
+    """SPI clock of each byte, Hz."""
     mosi: bytes = b""
 
     @property
     def is_command(self) -> bool:
-        """Whether it tells sensors to sample."""
+        """True if it is a command that makes sensors sample."""
         return len(self.mosi) == 2 and self.mosi[0] & 0x80 != 0
 
 
 def transactions(events: Events) -> list[Transaction]:
-    """Whole transactions, in order; pins that change at the same time are one edge."""
+    """Return the whole transactions, in order; pins that change at the same time are one edge."""
     selects = events["kind"] == SELECT
     same = selects[:-1] & selects[1:] & (events["t_ns"][:-1] == events["t_ns"][1:])
     found: list[Transaction] = []
@@ -232,7 +239,8 @@ def transactions(events: Events) -> list[Transaction]:
 
 
 def sweeps(found: Sequence[Transaction], slots: int, sensors: int) -> list[list[Transaction]]:
-    """The transactions of each whole sweep; a slot is a command and an answer of each sensor."""
+    """Return the transactions of each whole sweep: in each slot a command, and an answer of each
+    sensor."""
     starts = [at for at, one in enumerate(found) if one.is_command]
     size = slots * (1 + sensors)
     first = [starts[n] for n in range(0, len(starts) - slots + 1, slots)]
@@ -241,7 +249,7 @@ def sweeps(found: Sequence[Transaction], slots: int, sensors: int) -> list[list[
 
 @dataclass(frozen=True)
 class Timing:
-    """Figures of recorded sweeps, from the bus alone."""
+    """Clock and times of recorded sweeps, from the bus alone."""
 
     spi_hz: int
     settle_us: float
@@ -255,7 +263,7 @@ class Timing:
 
 
 def timing(whole: Sequence[Sequence[Transaction]], period_us: float) -> Timing:
-    """Figures of sweeps in a row."""
+    """Return clock and times of consecutive sweeps."""
     settles: list[float] = []
     gaps: list[float] = []
     for sweep in whole:

@@ -19,7 +19,7 @@ from tests.conftest import ROOT, data_dir
 BRIDGE: Final = ROOT / "deploy" / "bridge"
 FOLDER: Final = ROOT / "build" / "pico"
 EMULATOR_FOLDER: Final = ROOT / "build" / "emulated"
-"""Everything made here is in these two, which git does not see."""
+"""Folder of the emulator, as `FOLDER` is of the firmware; git ignores both."""
 COMPILER: Final = "arm-none-eabi-gcc"
 NEEDED: Final = {
     COMPILER: "gcc-arm-none-eabi",
@@ -35,11 +35,11 @@ SUBSET: Final = "pico-sdk-*-subset.tar.xz"
 
 
 class MissingError(Exception):
-    """Something that a build needs is not there; says what."""
+    """A build lacks a program or file; the message says which."""
 
 
 def shared_dir() -> Path | None:
-    """Folder of the pico-sdk's subset and of the boot ROM, or None where there is none."""
+    """Return the folder of the pico-sdk's subset and of the boot ROM; None if there is none."""
     data = data_dir()
     beside = ROOT.parent / "shared"
     candidates = [*([data.parent] if data else []), beside]
@@ -48,7 +48,7 @@ def shared_dir() -> Path | None:
 
 
 def image(sensors: int = 3, clock_mhz: int = 125, sequence: str = "electrodes") -> Path:
-    """Build an image and return its `.bin`, as it lies in flash from 0x10000000.
+    """Build the firmware and return its `.bin`, the content of the flash from 0x10000000.
 
     `clock_mhz` is the chip's system clock (125, 133, 200). Raises `MissingError` where a tool or
     the pico-sdk is missing.
@@ -106,7 +106,7 @@ def pico_sdk() -> Path:
 
 @contextmanager
 def _alone(path: Path) -> Iterator[None]:
-    """Let one process build at a time."""
+    """Hold the lock file at `path` during the block, so that one process builds at a time."""
     with path.open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield
@@ -120,7 +120,7 @@ def _run(*command: str | Path) -> None:
 
 
 def missing() -> str | None:
-    """Why nothing can be emulated here, in one line, or None."""
+    """Return why nothing can be emulated here, in one line; None if it can."""
     absent = [command for command in ("node", "npm", "cc") if shutil.which(command) is None]
     if absent:
         return f"no {', '.join(absent)} for the emulated chip"
@@ -134,7 +134,7 @@ def missing() -> str | None:
 
 
 def boot_rom() -> Path:
-    """The RP2040's boot ROM. Raises `MissingError`."""
+    """Return the file of the RP2040's boot ROM. Raises `MissingError`."""
     shared = shared_dir()
     if shared is None:
         raise MissingError("no boot ROM of the RP2040")
@@ -142,7 +142,7 @@ def boot_rom() -> Path:
 
 
 def emulator_folder() -> Path:
-    """The folder with `node_modules` and `sensors.node`, made if anything that it is of changed."""
+    """Return the folder with `node_modules` and `sensors.node`; rebuilt if sources changed."""
     digest = hashlib.sha256(b"".join(part.read_bytes() for part in _PARTS)).hexdigest()
     folder = EMULATOR_FOLDER
     folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Fixtures for the tests on the emulated chip; all are skipped where it cannot be."""
+"""Fixtures for the tests on the emulated chip; all are skipped if it cannot be emulated."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from tests.emulated.build import image as build_image
 from tests.emulated.build import missing
 
 Image = Callable[..., Path]
-"""`tests.emulated.build.image`"""
+"""Function that builds an image of the firmware: `tests.emulated.build.image`."""
 
 
 @pytest.fixture(scope="session")
 def image() -> Image:
-    """Builds an image, or skips the test and says why."""
+    """Function that builds an image; skips the test, and says why, if nothing can be emulated."""
     reason = missing()
     if reason is not None:
         pytest.skip(reason)
@@ -26,13 +26,13 @@ def image() -> Image:
 
 @pytest.fixture
 def board(image: Image) -> Iterator[Board]:
-    """A board without power."""
+    """An emulated board that is not switched on yet."""
     with Board() as one:
         yield one
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Emulated time is what is tested; real time only ends what hangs, on a busy computer too."""
+    """Give each test here 600 s of real time, so that it ends only a test that hangs."""
     for item in items:
         if item.path.is_relative_to(Path(__file__).parent):
             item.add_marker(pytest.mark.timeout(600))

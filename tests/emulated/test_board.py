@@ -14,7 +14,10 @@ STEP_MS = 25
 
 
 def turns(board: Board, ms: int) -> list[tuple[bool, int]]:
-    """How long, ms, the light was on and off in turn, without what both ends cut off."""
+    """Run the board for `ms`; return each on (True) or off time of its light, ms.
+
+    The first and last, which are cut off, are left out.
+    """
     seen = []
     for _ in range(ms // STEP_MS):
         board.run(STEP_MS)
@@ -46,21 +49,21 @@ def test_the_light_shows_idle_sweeping_and_a_missing_sensor(image: Image, board:
 
 
 def sweep_on(board: Board, count: int) -> list[bytes]:
-    """Wait for this number of SWEEPs more, to the pause between two of them."""
+    """Wait for this number of SWEEPs more, and return their payloads."""
     board.take(SWEEP)
     return board.until(SWEEP, count, 10.0 * (count + 2))
 
 
 @pytest.fixture
 def sweeping(image: Image, board: Board) -> Board:
-    """A board that has just said HELLO and START is sent."""
+    """A board that has greeted with HELLO, and to which START is sent."""
     board.power(image())
     assert all(serials(board.hello()))
     board.start()
     return board
 
 
-def test_an_unread_port_costs_frames_and_no_sweep(sweeping: Board) -> None:
+def test_an_unread_port_drops_frames_while_sweeps_continue(sweeping: Board) -> None:
     board = sweeping
     before = board.status()
     first = seq_of(sweep_on(board, 1)[0])
@@ -80,7 +83,9 @@ def test_an_unread_port_costs_frames_and_no_sweep(sweeping: Board) -> None:
 
 
 @pytest.mark.parametrize(("gone", "back"), [("close", "open"), ("detach", "attach")])
-def test_a_port_that_comes_back_is_greeted_again(sweeping: Board, gone: str, back: str) -> None:
+def test_after_a_port_comes_back_a_greeting_restarts_the_sweeps(
+    sweeping: Board, gone: str, back: str
+) -> None:
     board = sweeping
     sweep_on(board, 3)
     board.cut(gone)

@@ -1,4 +1,4 @@
-"""Times on the sensors' bus, from its edges: what the manual asks for holds at every clock."""
+"""Times on the sensors' bus keep the manual's limits at every clock of the chip."""
 
 from __future__ import annotations
 
@@ -42,15 +42,15 @@ COMMANDS = {
     "all": bytes([PAC, PDC, TAC, TDC]) + ELECTRODE_COMMANDS,
     "interleaved": b"".join(bytes([one, PAC]) for one in (*ELECTRODE_COMMANDS, PDC, TAC, TDC)),
 }
-"""Commands by sequence (manual table 12)."""
+"""First command byte of each slot, by the sequence's name (manual table 12)."""
 SETTLE_US, GAP_US = 50.0, 5.0
 """Least times between a command and an answer, and after an answer (manual figure 14)."""
 SPI_HZ_MIN, SPI_HZ_ASKED = 500_000, 4_400_000
-"""Slowest clock that a sensor takes (manual section 8.2), and the one that is asked for."""
+"""Slowest SPI clock of a sensor (manual section 8.2), and the clock that the firmware requests."""
 LATE_US = 20.0
-"""A turn of the firmware's loop, with USB served in it: the most that a sweep may begin late."""
+"""Most by which a sweep may begin late, us: a round of the firmware's loop, with USB."""
 OWN_TIME = 1.25
-"""A sweep takes no longer than this times its bits and waits."""
+"""Longest time of a sweep, as a multiple of that of its bits and waits."""
 
 
 @dataclass(frozen=True)
@@ -72,17 +72,17 @@ SETTINGS = (
 
 @dataclass(frozen=True)
 class Run:
-    """What a board with this setting did: the greeting, then some sweeps."""
+    """Result of a board with this setting: its state, the greeting, then some sweeps."""
 
     setting: Setting
     state: dict[str, Any]
     hello: bytes
     greeting: list[Transaction]
-    """On the bus while sensors were looked for."""
+    """Transactions on the bus while the board searched for sensors."""
     said: list[bytes]
-    """SWEEPs."""
+    """Payloads of the SWEEPs that the host received."""
     swept: list[list[Transaction]]
-    """The same on the bus."""
+    """Transactions on the bus, by sweep."""
 
     @property
     def timing(self) -> Timing:
@@ -131,7 +131,7 @@ def test_the_emulated_board_reports_its_build_options(run: Run) -> None:
     assert run.hello[45 + 16 * sensors :] == COMMANDS[run.setting.sequence]
 
 
-def test_sweeps_carry_what_the_sensors_feel(run: Run) -> None:
+def test_sweeps_have_the_simulated_sensors_counts_and_no_error_words(run: Run) -> None:
     assert [seq_of(sweep) for sweep in run.said] == list(range(len(run.said)))
     assert len(run.said) in (SWEEPS, SWEEPS - 1)  # the last may be under way
     at = [COMMANDS[run.setting.sequence].index(command) for command in ELECTRODE_COMMANDS]
@@ -142,7 +142,7 @@ def test_sweeps_carry_what_the_sensors_feel(run: Run) -> None:
         assert not set(words.ravel().tolist()) & {*ERROR_WORDS, 0x0000, 0xFFFF}
 
 
-def test_a_sensor_gets_50_us_before_and_5_after(run: Run) -> None:
+def test_sensors_get_50_us_before_an_answer_and_5_after(run: Run) -> None:
     assert run.timing.settle_us >= SETTLE_US
     assert run.timing.gap_us >= GAP_US
     assert run.timing.late_us < LATE_US
@@ -155,7 +155,7 @@ def test_a_sensor_gets_50_us_before_and_5_after(run: Run) -> None:
         assert ask.low_ns - answer.high_ns >= GAP_US * 1e3
 
 
-def test_the_clock_of_spi_is_one_that_a_sensor_takes(run: Run) -> None:
+def test_the_spi_clock_is_within_a_sensors_limits(run: Run) -> None:
     clocks = {hz for sweep in run.swept for one in sweep for hz in one.hz}
     assert len(clocks) == 1
     assert SPI_HZ_MIN <= min(clocks) <= SPI_HZ_ASKED

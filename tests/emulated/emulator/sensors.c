@@ -11,7 +11,7 @@ enum { SENSORS = COUNTS_SENSORS_MAX, ARGUMENTS_MAX = 4 };
 static struct sim_sensor sensor[SENSORS];
 static struct counts counts;
 
-/* The arguments that are numbers; the first one, where a sensor is named, names one. */
+/* Put the call's numbers into `value`, 0 for missing ones; the first may be a sensor's, from 0. */
 static void take_numbers(napi_env env, napi_callback_info info, double value[ARGUMENTS_MAX])
 {
     napi_value argument[ARGUMENTS_MAX];
@@ -60,7 +60,7 @@ static napi_value init(napi_env env, napi_callback_info info)
     return NULL;
 }
 
-/* row(k): what the sensors feel in the k-th sweep since START. */
+/* row(k): give the sensors the counts of the k-th sweep since START, from 0. */
 static napi_value row(napi_env env, napi_callback_info info)
 {
     double value[ARGUMENTS_MAX];
