@@ -1,4 +1,4 @@
-"""What the tests of the installer need: small wheels, and installations below a folder."""
+"""Helpers for the tests of the installer: small wheels, and installations below a folder."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ TIMEOUT_S = 200
 
 
 def wheelhouse(folder: Path, version: str, *, starts: bool = True) -> Path:
-    """A folder with one wheel: a stand-in for graspd that tells its version, and needs nothing.
+    """Make a folder with one wheel: a stand-in for graspd that prints its version, without needs.
 
-    The real one needs 100 MB of other wheels; tests/system installs it. With `starts` false it
-    fails as soon as it is run.
+    The real one needs 100 MB of other wheels; tests/system installs it. `starts` False: the
+    stand-in fails when it is run.
     """
     folder.mkdir(parents=True)
     info = f"graspd-{version}.dist-info"
@@ -37,13 +37,13 @@ def wheelhouse(folder: Path, version: str, *, starts: bool = True) -> Path:
 
 
 def installer(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    """Run it, with this Python for the environment."""
+    """Run install.sh with these arguments, and this Python for its virtual environment."""
     command = [str(part) for part in (INSTALLER, "--python", sys.executable, *arguments)]
     return subprocess.run(command, check=False, capture_output=True, text=True, timeout=TIMEOUT_S)
 
 
 def install(root: Path, wheels: Path, *arguments: str) -> str:
-    """Install below `root`; what it said."""
+    """Install below `root` from the folder `wheels`; return the installer's output."""
     done = installer("--root", root, "--wheelhouse", wheels, *arguments)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
@@ -57,20 +57,21 @@ mount --rbind /dev "$1/root/dev"
 mount --rbind /proc "$1/root/proc"
 exec chroot "$1/root" sh -euc "$2"
 """
-"""Makes a copy of this computer's files, in which no systemd runs, and runs a script there."""
+"""Script that mounts a copy of this computer's files at $1, and runs the script $2 in it, where no
+systemd runs."""
 
 
 def in_a_chroot(folder: Path, script: str) -> subprocess.CompletedProcess[str]:
-    """Run a shell script as root on a copy of this computer's files, which is then gone.
+    """Run a shell script as root on a copy of this computer's files, which is discarded afterwards.
 
-    `folder` is where the copy is put, and is left empty.
+    `folder`: where the copy is mounted; it is empty before and afterwards.
     """
     command = ["unshare", "--mount", "sh", "-euc", IN_A_CHROOT, "sh", str(folder), script]
     return subprocess.run(command, check=False, capture_output=True, text=True, timeout=TIMEOUT_S)
 
 
 def content(root: Path) -> dict[str, str]:
-    """Every file and link below `root`: its path, with what it holds or where it leads."""
+    """Return the paths of all files and links below `root`, with checksum or target."""
     return {
         f"/{path.relative_to(root)}": str(path.readlink())
         if path.is_symlink()
@@ -81,7 +82,7 @@ def content(root: Path) -> dict[str, str]:
 
 
 def version_below(root: Path, prefix: str = "/opt/graspd") -> str:
-    """What the graspd that is installed below `root` says of itself."""
+    """Return what the graspd installed below `root` prints as its version."""
     python = f"{root}{prefix}/venv/bin/python"
     done = subprocess.run(
         [python, "-I", "-m", "graspd", "--version"], capture_output=True, text=True, check=True

@@ -33,11 +33,11 @@ FILES = {
     "/usr/local/share/man/man1/graspd.1",
     "/etc/graspd/right.toml",
 }
-"""Installed everywhere, outside the prefix."""
+"""Files that the installer always makes outside the prefix."""
 BACKOFF = "/usr/local/lib/systemd/system/graspd@.service.d/backoff.conf"
-"""Installed where systemd is new enough."""
+"""File that is installed only if systemd is new enough."""
 NETWORK = "/usr/local/lib/systemd/network/80-graspd-can.network"
-"""Installed on demand."""
+"""File that is installed only with `--can`."""
 
 pytestmark = pytest.mark.slow
 pytest.importorskip("ensurepip", reason="no venv: apt install python3-venv")
@@ -73,7 +73,7 @@ def test_every_file_goes_to_its_place(pristine: Path) -> None:
     assert version_below(pristine) == "graspd 0.1.0"
 
 
-def test_nothing_that_is_staged_names_the_stage(pristine: Path) -> None:
+def test_no_installed_file_contains_the_staging_path(pristine: Path) -> None:
     files = [path for path in pristine.rglob("*") if path.is_file() and not path.is_symlink()]
     assert [path for path in files if str(pristine).encode() in path.read_bytes()] == []
     environment = (pristine / "opt/graspd/venv").readlink()
@@ -81,7 +81,7 @@ def test_nothing_that_is_staged_names_the_stage(pristine: Path) -> None:
     assert program.startswith(f"#!/opt/graspd/{environment}/bin/python")
 
 
-def test_byte_code_is_installed_before_the_service_starts(pristine: Path) -> None:
+def test_the_installer_compiles_byte_code(pristine: Path) -> None:
     assert list(pristine.glob("opt/graspd/venv/lib/*/site-packages/graspd/__pycache__/__main__*"))
 
 
@@ -101,7 +101,7 @@ def test_a_scene_is_never_overwritten(staged: Path, wheels: Path) -> None:
     assert not scene.exists(), "an example was put beside a scene that is in use"
 
 
-def test_a_newer_graspd_replaces_the_former_once_that_ended(staged: Path, tmp_path: Path) -> None:
+def test_an_upgrade_keeps_the_former_version_while_it_is_used(staged: Path, tmp_path: Path) -> None:
     folder = staged / "opt/graspd"
     former = folder / (folder / "venv").readlink()
     newer = wheelhouse(tmp_path / "second", "0.2.0")
@@ -118,7 +118,7 @@ def test_a_newer_graspd_replaces_the_former_once_that_ended(staged: Path, tmp_pa
 
 @contextlib.contextmanager
 def something_that_uses(environment: Path) -> Iterator[None]:
-    """A process that has a file of it mapped, as a daemon has its libraries."""
+    """Run a process that has a file of `environment` mapped, as a daemon has its libraries."""
     code = (
         "import mmap, sys\n"
         "with open(sys.argv[1], 'rb') as file, mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ):\n"
@@ -134,7 +134,7 @@ def something_that_uses(environment: Path) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("kind", ["no wheel at all", "one that does not start"])
-def test_a_graspd_that_fails_leaves_the_former_as_it_was(
+def test_a_failed_upgrade_leaves_the_former_version_unchanged(
     kind: str, staged: Path, tmp_path: Path
 ) -> None:
     newer = wheelhouse(tmp_path / "second", "0.2.0", starts=False)
@@ -205,7 +205,7 @@ def test_another_prefix_is_named_everywhere_and_remembered(wheels: Path, tmp_pat
         ),
     ],
 )
-def test_a_prefix_where_others_may_write_is_refused(
+def test_an_unsafe_or_unusable_prefix_is_refused_without_changes(
     tmp_path: Path, wheels: Path, prefix: str, why: str
 ) -> None:
     root = tmp_path / "root"
@@ -290,7 +290,9 @@ def test_unknown_extra_is_refused_before_anything_is_made(staged: Path, wheels: 
     assert " record " in done.stderr
 
 
-def test_can0_is_brought_up_only_for_those_who_ask(staged: Path, wheels: Path) -> None:
+def test_the_can_option_installs_and_later_renews_the_network_file(
+    staged: Path, wheels: Path
+) -> None:
     install(staged, wheels, "--can")
     file = staged / NETWORK.lstrip("/")
     assert file.read_text() == (DEPLOY / "network/80-graspd-can.network").read_text()

@@ -16,11 +16,12 @@ LICHTBLICK = json.loads((LAYOUTS / "lichtblick.json").read_bytes())
 PANELS = {"Image", "Plot", "StateTransitions", "RosOut"}
 """Panels of Lichtblick, by the names in its sources; RosOut is the log."""
 QUOTED = re.compile(r'"([a-z]+)\.right"\.([A-Za-z0-9_.]+)(\[\d+\])?')
-"""A message path of a topic whose name has a dot: Lichtblick wants that in quotes."""
+"""Pattern of a message path in Lichtblick, which needs quotes for a topic's name with a dot."""
 
 
 def has(topic: str, field: str, *, in_list: bool = False) -> bool:
-    """Whether messages of a topic have a field, such as `motion.ff`, that holds one value."""
+    """True if messages of a topic have a field, such as `motion.ff`, of one value; `in_list`: of a
+    list."""
     told = json.loads(schemas()[topic][1])
     for name in field.split("."):
         told = told["properties"].get(name, {"type": "object", "properties": {}})
@@ -40,7 +41,7 @@ def test_paths_of_the_lichtblick_layout_are_in_the_schemas() -> None:
         assert has(match[1], match[2], in_list=match[3] is not None), path
 
 
-def test_image_and_log_panels_show_topics_of_theirs() -> None:
+def test_image_and_log_panels_show_topics_of_their_type() -> None:
     panels = LICHTBLICK["configById"]
     (image,) = [panel for name, panel in panels.items() if name.startswith("Image!")]
     (log,) = [panel for name, panel in panels.items() if name.startswith("RosOut!")]

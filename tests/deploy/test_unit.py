@@ -16,11 +16,11 @@ from tests.deploy.staging import DEPLOY, INSTALLER
 
 UNIT = DEPLOY / "systemd/graspd@.service"
 EXPOSURE_MAX_TENTHS = 25
-"""Largest score of `systemd-analyze security`, from 0 (closed) to 100."""
+"""Largest exposure by `systemd-analyze security`, in tenths: from 0 (closed) to 100 (open)."""
 
 
 def settings(path: Path) -> dict[str, list[str]]:
-    """Values of each key of a file in the syntax of systemd.syntax(7)."""
+    """Return the values of each key of a file in the syntax of systemd.syntax(7)."""
     found: dict[str, list[str]] = {}
     for key, value in re.findall(r"^(\w+)=(.*)$", path.read_text(), re.MULTILINE):
         found.setdefault(key, []).append(value)
@@ -51,7 +51,7 @@ def test_systemd_understands_the_unit(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_the_service_is_exposed_to_little() -> None:
+def test_the_units_security_exposure_is_below_the_limit() -> None:
     analyze = tool("systemd-analyze", "systemd")
     options = ["--offline=true", f"--threshold={EXPOSURE_MAX_TENTHS}", "--no-pager"]
     done = run(analyze, "security", *options, UNIT)
@@ -78,7 +78,7 @@ def test_udev_understands_the_rules() -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_the_unit_keeps_what_the_daemon_needs() -> None:
+def test_the_units_paths_restarts_and_commands_fit_the_daemon() -> None:
     unit = settings(UNIT)
     scene = Scene(hand=Hand(name="left"), tactile=SpiTactile(driver="spi", port="/dev/ttyACM0"))
     (runtime,), (state,) = unit["RuntimeDirectory"], unit["StateDirectory"]
@@ -100,7 +100,7 @@ def test_every_priority_that_a_scene_may_name_is_granted() -> None:
         Realtime(priority=int(limit) + 1)
 
 
-def test_folders_have_the_same_rights_from_every_maker() -> None:
+def test_the_unit_and_tmpfiles_make_folders_with_equal_rights() -> None:
     unit = settings(UNIT)
     wanted = {
         f"/run/{unit['RuntimeDirectory'][0]}": unit["RuntimeDirectoryMode"][0],
@@ -113,7 +113,7 @@ def test_folders_have_the_same_rights_from_every_maker() -> None:
     assert all([kind, *rest] == ["d", *owner, "-"] for kind, _, _, *rest in made)
 
 
-def test_the_bus_has_the_rate_of_the_protocol() -> None:
+def test_the_network_file_sets_the_protocols_bit_rate() -> None:
     network = settings(DEPLOY / "network/80-graspd-can.network")
     protocol = (DEPLOY / "can/PROTOCOL.md").read_text()
     assert "ip link set can0 type can bitrate 1000000 restart-ms 100\n" in protocol
