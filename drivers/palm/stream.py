@@ -199,7 +199,7 @@ class PalmStream:
         outage_ns = t_ns - self._place_t_ns
         missed = outage_ns // ROUND_NS if outage_ns <= OUTAGE_NS else 1
         self._miss(missed)
-        self._begin(self._round + missed + 1)
+        self._begin(self._round + 1)
         return self._round * ROUND
 
     def _move_on(self, to_round: int) -> Sequence[TactileReading]:

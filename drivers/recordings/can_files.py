@@ -137,7 +137,7 @@ def _logged(message: can.Message | None, text: str, first_channel: int = 0) -> L
 def _is_classic(text: str, data_bytes: int) -> bool:
     """Return True if a line `CANFD` of an ASC file says that its frame is a classic one."""
     words = text.split()
-    name_words = 0 if words[5:6] and words[5].isdigit() else 1
+    name_words = 0 if "".join(words[5:6]).isdigit() else 1
     flags = words[11 + name_words + data_bytes :]
     try:
         return bool(flags) and not int(flags[0], 16) & FD_FLAG

@@ -218,6 +218,23 @@ def test_an_unstamped_frame_arrived_since_the_bus_was_last_empty(
     bus.close()
 
 
+def test_server_stamps_date_frames_by_the_quickest_delay(monkeypatch: pytest.MonkeyPatch) -> None:
+    scripted, clock = ScriptedBus(), Clock(1_000 * MS)
+    monkeypatch.setattr("graspd.drivers.can.bus.open_bus", lambda *_, **__: scripted)
+    bus = CanBus("socketcand", "x", None, clock, Clock(0), {"host": "127.0.0.1", "port": 1})
+    bus.open()
+    arrived = []
+    for now_ms, stamp_s in ((1010, 100.0), (1050, 100.01), (1060, 99.0)):
+        clock.now_ns = now_ms * MS
+        received = message(b"\0", 0x7FF)
+        received.timestamp = stamp_s
+        scripted.script.append(received)
+        arrived += [(since_ns / MS, now_ns / MS) for _, since_ns, now_ns in bus.drain()]
+    for found, expected in zip(arrived, [(1010, 1010), (1020, 1020), (1050, 1060)], strict=True):
+        assert found == pytest.approx(expected, abs=0.1)
+    bus.close()
+
+
 LIMIT_S = 60.0
 QUIET_NS = 2_000_000_000
 

@@ -66,6 +66,15 @@ def test_a_cut_is_counted_if_a_sample_came_before() -> None:
     assert counters.cut_sweeps == 1
 
 
+def test_only_a_link_that_broke_between_readings_interrupts_them() -> None:
+    sweeps, _ = assembler()
+    sweeps.interrupt()
+    readings = feed(sweeps, samples(0))
+    sweeps.interrupt()
+    readings += feed(sweeps, concatenated([samples(1), samples(2)]))
+    assert [reading.interrupted for reading in readings] == [False, True, False]
+
+
 def test_channels_that_the_sequence_lacks_are_counted() -> None:
     sweeps, counters = assembler("electrodes")
     stream = samples(0)

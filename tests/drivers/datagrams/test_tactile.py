@@ -159,8 +159,9 @@ def test_an_unknown_finger_name_is_left_out_and_counted() -> None:
         ([{"seq": 1, "t": n} for n in range(20)], [0]),
         ([{"seq": 5}, {"seq": None, "t": 9}, {"seq": 5}, {"seq": None, "t": 9}], [0, 1]),
         ([{"seq": n, "t": n / 100} for n in (500, *range(12))], [0, 11, 12]),
+        ([{"seq": n} for n in (500, *range(6), 501, *range(6, 17))], [0, 7, 18]),
     ],
-    ids=["by number", "by time", "time stands", "number stands", "in turns", "a new start"],
+    ids=["by number", "by time", "time stands", "number stands", "in turns", "new start", "late"],
 )
 def test_a_message_that_is_not_newer_is_dropped(
     stamps: list[dict[str, Any]], taken: list[int]
@@ -202,6 +203,13 @@ def test_falling_sender_time_a_second_late_starts_a_new_zero(
     clock = SenderClock()
     clock.made_ns(5.0, 1000 * MS)
     assert clock.made_ns(t_s, received_ms * MS) / MS == pytest.approx(made_ms, abs=0.03)
+
+
+def test_a_message_over_100_ms_late_is_counted() -> None:
+    stream = TactileStream(FINGERS, "right")
+    for number, received_ms in enumerate((1000, 1010, 1119, 1140)):
+        stream.receive(message(seq=number, t=number / 100), received_ms * MS)
+    assert stream.counters.late_messages == 1
 
 
 def test_the_first_reading_after_restart_or_outage_is_interrupted() -> None:

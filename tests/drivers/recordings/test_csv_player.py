@@ -168,6 +168,15 @@ def test_unknown_columns_of_all_files_are_logged_once(
     assert record.getMessage().endswith("'x8'"), "ten names"
 
 
+@pytest.mark.parametrize(("name", "unit"), [("t_ms", ["ms"]), ("t", [])])
+def test_a_unit_of_times_other_than_seconds_is_logged(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, name: str, unit: list[str]
+) -> None:
+    content = stream(["0", "0.5", "1", "1.5"]).replace(b"t,", f"{name},".encode(), 1)
+    with caplog.at_level(logging.INFO), ReplayDriver([write(tmp_path, content)], speed=None):
+        assert [record.getMessage().split()[-1] for record in caplog.records] == unit
+
+
 def test_a_bad_row_is_raised_after_the_readings_before_it(tmp_path: Path) -> None:
     path = write(tmp_path, table(2) + b"apple,0,1\n" + table(1))
     clock = Clock()
