@@ -262,6 +262,7 @@ def test_a_clock_that_stood_after_a_short_ping_is_doubted() -> None:
     clock = DeviceClock(TICK_HZ, TICK_HZ, START_NS, START_NS + 100 * MS)
     clock.round_trip(2 * TICK_HZ, START_NS + S, START_NS + S)
     assert not clock.is_doubted
+    assert clock.round_trip_ns == 0, "the shortest"
     late_ns = START_NS + 2 * S + 20 * MS
     clock.round_trip(3 * TICK_HZ, late_ns, late_ns)
     assert clock.is_doubted
