@@ -82,9 +82,10 @@ def trained_on(
 ) -> list[dict[str, str]]:
     """Return for each model the recordings with grasps on which it was trained.
 
-    Each result maps names of recordings to a text on the grasps that are known. A table is found
-    by its content, not by its name. `layouts`: see `Plan`. All models judge the same fingers.
-    Raises `RecordingError` and `ModelError`.
+    Each result maps file names of recordings to a text with the number of grasps that the model
+    knows. Grasps and tables are recognised by their content, not by name. `layouts`: layout of each
+    recording, by path. The `models` must judge the same fingers. Raises `RecordingError` and
+    `ModelError`.
     """
     known = [known_grasps.of_model(model) for model in models]
     found: list[dict[str, str]] = [{} for _ in models]

@@ -192,7 +192,7 @@ class RunSummary:
         self.repaired += verdict.valid and bool(verdict.repaired)
 
     def outcome(self, grasp: GraspId, *, slipped: bool) -> None:
-        """Count the outcome of a grasp after its verdict; only the first counts."""
+        """Count an outcome of a grasp whose verdict is counted and has none; ignore others."""
         decision = self._waiting.pop(grasp, None)
         if decision is not None:
             self.tally.outcome(decision, slipped=slipped)
@@ -272,7 +272,8 @@ class Printer(Companion):
         self._gate: GateState | None = None
 
     def on_verdict(self, published: PublishedVerdict) -> None:
-        """Count a verdict. Print it, with a recorded outcome, if it is news or with `as_json`."""
+        """Count a verdict. Print its message if `as_json` is set; else, if it is news, a line with
+        the recorded outcome."""
         verdict, reading = published.verdict, published.reading
         annotation = reading.annotation if reading else None
         self.result.add(verdict, annotation.slipped if annotation else None, published.grasp)

@@ -273,7 +273,7 @@ class LiftBook:
         self._unkept.discard(grasp)
 
     def exchanged(self) -> None:
-        """Note that a sensor was exchanged: nothing is learned from outcomes still to come."""
+        """Note that a sensor was exchanged: outcomes of the lifts until now teach nothing more."""
         self._lifts = {grasp: replace(lift, features=None) for grasp, lift in self._lifts.items()}
 
     def state(self) -> LiftBookState:

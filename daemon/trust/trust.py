@@ -135,7 +135,9 @@ class Trust:
     ) -> None:
         """Start learning again for new sensors. Raises `ValueError` if `learned` does not fit.
 
-        `learned`: earlier learning on them; None: none. `proven`, `budget`: see `Exchanged`.
+        `learned`: what was learned with these sensors before; None: nothing. `proven`: number of
+        their known outcomes, for the warm-up. `budget`: number of slips that the risk still allowed
+        with them; None: not known.
         """
         self.learner.reset()
         if learned is not None:

@@ -93,7 +93,10 @@ def refuse_unusable(interface: str, channel: str, bitrate: int | None, options: 
 
 
 def open_bus(interface: str, channel: str, **options: Any) -> can.BusABC:  # noqa: ANN401
-    """Open a bus of python-can. Raises `LinkError`; `DriverError` if no retry can succeed."""
+    """Open a bus of python-can; `options`: further arguments of its constructor.
+
+    Raises `LinkError`, or `DriverError` if no retry can succeed.
+    """
     where = f"cannot open {interface} {channel}"
     if interface == "socketcan":
         try:
@@ -165,8 +168,8 @@ def _refuse_bitrate(interface: str, bitrate: int | None) -> None:
 
 
 def _refuse_options(interface: str, options: Options) -> None:
-    """Raise `ValueError` for options that are missing, unknown, of a wrong type, or whose value
-    `OWN_OPTIONS` fixes."""
+    """Raise `ValueError` for options that are missing, unknown, of a wrong type, in `_OWN_KEYS`, or
+    different from `OWN_OPTIONS`."""
     constructor = _constructor(interface)
     parameters = inspect.signature(constructor).parameters
     named = {name for name, each in parameters.items() if each.kind is not each.VAR_KEYWORD}

@@ -126,9 +126,9 @@ class SweepClock:
         return self.t_ns + round(left * self.period_ns)
 
     def end(self, last: int) -> int:
-        """End a sweep whose furthest place is `last`; return the number of sweeps missed before it.
+        """End a sweep whose furthest place is `last`; return the number missed just before it.
 
-        The period is learned from two complete sweeps in a row.
+        The number is 1 after an outage. Two complete sweeps in a row teach the period.
         """
         missed = 0
         period_ns = self.period_ns

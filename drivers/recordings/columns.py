@@ -121,8 +121,8 @@ class Columns:
     def of(cls, path: Path, names: Sequence[str], fingers: Sequence[str], line: int) -> Columns:
         """Return the columns to read for `fingers`; without any, for all that the file has.
 
-        `names`: the header, at line `line`. Raises `RecordingError` for columns that are missing or
-        occur twice.
+        `names`: the header, at line `line`. Raises `RecordingError` for columns that are missing,
+        occur twice or are in degrees, and for electrodes whose finger is not clear.
         """
         plain = [_UNIT.sub("", name) for name in names]
         found = _electrodes(path, plain, fingers, line)

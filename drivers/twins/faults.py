@@ -46,7 +46,7 @@ class LinkFaults:
             raise ValueError("disconnect_every_frames must be at least 1")
 
     def refuse(self, link: str, *names: str) -> None:
-        """Raise `ValueError` if a fault of `names` is set, which a twin of `link` cannot show."""
+        """Raise `ValueError` if a fault in `names` is set: a twin of `link` cannot show them."""
         for name in names:
             if getattr(self, name) != getattr(LinkFaults(), name):
                 raise ValueError(f"{link} cannot show the fault {name.replace('_', '-')}")

@@ -312,7 +312,7 @@ class SpiTwin(Opened):
         self._drain()
 
     def _write(self, data: bytes) -> None:
-        """Queue a whole frame; drop it if the host does not read, so that too many bytes wait."""
+        """Queue a whole frame; drop it if too many bytes wait, as when the host does not read."""
         if self._unsent_bytes + len(data) > UNSENT_MAX_BYTES and self._unsent:
             self.tx_dropped += 1
             return

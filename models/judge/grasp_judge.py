@@ -188,7 +188,8 @@ class GraspJudge:
         return Opinion(p_slip, None, repaired, margin)
 
     def observe(self, examined: Examined, opinion: Opinion) -> None:
-        """Let the session learn from a grasp with its opinion, if it may."""
+        """Let the session learn from a grasp and the opinion on it, unless `examined.grasp` is
+        None or there is no session."""
         if self.session is None or examined.grasp is None:
             return
         p_slip = opinion.p_slip

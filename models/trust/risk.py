@@ -90,13 +90,16 @@ class RiskOutcomes(NamedTuple):
 class Risk:
     """The online rule: `stable` only while a slip is affordable, and only for likely stable grasps.
 
-    With a = `max_slip_when_stable`, N `stable` lifts and S slips among them, M = `outstanding_max`:
+    A lift is announced when its `lift` question is answered `stable`. With
+    a = `max_slip_when_stable`, N `stable` lifts with an outcome, S slips among them, and
+    M = `outstanding_max`:
 
-        S <= a N + BUDGET_START            S <= a N + BUDGET_MAX of any stretch of lifts
-        S <= a N + BUDGET_START + M (1 - a)     of all lifts with an outcome, or announced
+        S <= a N + BUDGET_START                if each outcome is told before the next `stable`
+        S <= a N + BUDGET_MAX                  then also in any stretch of lifts
+        S <= a N + BUDGET_START + M (1 - a)    if each lift is announced; no outcome: a slip
 
-    1. The outcome of a `stable` lift adds a - y to the budget b, y = 1 for a slip, 0 otherwise; all
-       else only lowers b.
+    1. The outcome of a `stable` lift adds a - y to the budget b, y = 1 for a slip, 0 otherwise. The
+       cap BUDGET_MAX and an exchange of sensors only lower b.
     2. Hence b <= BUDGET_START + a N - S, which is S <= a N + BUDGET_START - b.
     3. A stretch begins at b <= BUDGET_MAX. In the same way S <= a N + BUDGET_MAX - b for it.
     4. `stable` is said only while b >= 1 - a. If each outcome is told before the next `stable`,
@@ -104,8 +107,9 @@ class Risk:
     5. Let m announced lifts be out. w = b - m (1 - a) is what is left of b if all of them slip.
     6. An announced grasp was called `stable` at b >= 1 - a and m < M. Hence w >= -(M - 1) (1 - a)
        after its announcement.
-    7. An outcome of an announced lift lowers neither w nor this minimum: a slip takes 1 - a from b
-       and m by one. Caps leave b >= BUDGET_START, and m <= M.
+    7. An outcome of an announced lift does not lower w: a slip takes 1 - a from b and 1 from m. The
+       cap leaves b >= BUDGET_START, and m <= M. An exchange may lower b further; that only makes
+       `stable` rarer, so the bounds with the higher b still hold.
     8. An announced lift that leaves the book without an outcome counts as a slip. Hence 6 holds at
        every moment.
     9. With the m lifts counted as slips, 2 is S <= a N + BUDGET_START - w: the third bound.
@@ -211,7 +215,8 @@ class Risk:
     def exchanged(self, proven: int = 0, budget: float | None = None) -> None:
         """Keep the slips but not the saved-up budget. Call when a sensor was exchanged.
 
-        `proven`, `budget`: last known values with the new sensors; see `Exchanged`.
+        `proven`: number of known outcomes with the new sensors. `budget`: number of slips that were
+        still allowed when they were last used; None: not known.
         """
         self.budget = min(self.budget, BUDGET_START)
         if budget is not None:  # not below the budget that follows from the counted slips

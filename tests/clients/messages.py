@@ -98,7 +98,7 @@ _anything = st.one_of(
 
 @st.composite
 def _added(draw: st.DrawFn, known: bool) -> dict[str, Any]:
-    """Draw the fields that newer daemons add, or some of them; `known`: verdict not unknown."""
+    """Draw the fields that newer daemons add, or some; `known`: for verdict `stable` or `slip`."""
     risk: dict[str, Any] = RISK | {"slips": draw(st.sampled_from([0, 2, 41, 42]))}
     if draw(st.booleans()):
         risk |= {draw(st.sampled_from(sorted(RISK))): draw(_anything)}

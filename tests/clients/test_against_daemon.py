@@ -27,7 +27,7 @@ pytestmark = pytest.mark.slow
 
 @contextmanager
 def watching(lift_gate: Path, *words: str | Path) -> Iterator[subprocess.Popen[str]]:
-    """Run `lift_gate --watch` with these arguments during the block."""
+    """Run `lift_gate --watch`, then `words`, during the block; yield the process."""
     command = [lift_gate, "--watch", *words]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
@@ -37,7 +37,7 @@ def watching(lift_gate: Path, *words: str | Path) -> Iterator[subprocess.Popen[s
 
 
 def line_with(process: subprocess.Popen[str], *wanted: str) -> list[str]:
-    """Read lines up to one with any of these words, and return its words."""
+    """Read lines up to the first that has any of `wanted`; return that line's words."""
     assert process.stdout is not None
     while True:
         words = process.stdout.readline().split()

@@ -48,7 +48,8 @@ ABSENT = Biotac(pac0=0, pac1=0, pdc=-9784, tac=32518, tdc=0, electrodes=array("h
 
 
 def header(number: int) -> SimpleNamespace:
-    """Make a `std_msgs/Header`, 10 ms per `number`; `to_sec` and `seq` exist only in ROS 1."""
+    """Make a `std_msgs/Header` of `number` times 10 ms after `START_S`, with the fields of ROS 2
+    and those that only ROS 1 has, `to_sec` and `seq`."""
     time_s = START_S + number / 100
     stamp = SimpleNamespace(sec=START_S, nanosec=number * 10_000_000, to_sec=lambda: time_s)
     return SimpleNamespace(seq=number, stamp=stamp)

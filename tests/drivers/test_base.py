@@ -205,7 +205,7 @@ def test_the_command_that_hangs_a_sensor_is_never_made() -> None:
         sample_command(16)
 
 
-def test_a_count_has_the_word_of_the_manual() -> None:
+def test_counts_become_the_response_words_of_the_manual_and_back() -> None:
     assert {count: encode_word(count) for count in VECTORS} == VECTORS
     counts, faults = decode_words(words(*VECTORS.values()))
     assert counts.tolist() == list(VECTORS)

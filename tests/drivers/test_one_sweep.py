@@ -230,7 +230,7 @@ ASSEMBLERS = {
 
 
 @pytest.mark.parametrize("name", ASSEMBLERS)
-def test_no_reading_mixes_two_sweeps_or_looks_too_new(name: str) -> None:
+def test_no_reading_mixes_sweeps_or_is_dated_after_its_data(name: str) -> None:
     assembler = ASSEMBLERS[name]
 
     @settings(max_examples=assembler.examples, derandomize=True)

@@ -177,7 +177,7 @@ def test_every_piece_of_a_split_graph_is_checked() -> None:
 
 
 def test_a_data_location_beyond_32_bits_is_refused() -> None:
-    """Other readers keep the lowest 32 bits, which are 1: data in another file."""
+    """`data_location` is 2**32 + 1. Other readers keep its low 32 bits, 1: data in another file."""
     location = bytes([14 << 3]) + b"\x81\x80\x80\x80\x10"  # 2**32 + 1
     tensor = b"\x42\x01w" + location
     graph = b"\x2a" + bytes([len(tensor)]) + tensor

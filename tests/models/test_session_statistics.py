@@ -105,7 +105,7 @@ def test_many_slips_in_a_row_hardly_move_the_mean() -> None:
     assert (halves(900).mean < 530.0).all()
 
 
-def test_a_wrong_start_fades_even_if_all_count_as_slips() -> None:
+def test_a_wrong_first_mean_fades_though_later_grasps_are_slips() -> None:
     """The first 20 grasps read 900. All later ones read 500 and are called slips."""
     session, random = statistics(), np.random.default_rng(4)
     observe(session, grasps(20, mean=900.0))

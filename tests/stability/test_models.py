@@ -66,7 +66,9 @@ def test_the_default_model_keeps_the_bounds_on_real_grasps(bts3_dir: Path) -> No
 # The comparison itself finds what is wrong.
 
 
-def test_a_wrong_reference_breaks_the_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_comparison_notices_a_reference_with_swapped_probabilities(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     right = Reference.probabilities
     monkeypatch.setattr(Reference, "probabilities", lambda *args: right(*args)[:, ::-1])
     assert {"network", "p_slip", "flips"} <= set(compared("mlp").broken)

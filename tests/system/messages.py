@@ -1,4 +1,4 @@
-"""Messages that a subscriber inside receives, with their arrival by the machine's clock."""
+"""Messages that a subscriber in the emulated machine receives, with arrival by its clock."""
 
 from __future__ import annotations
 

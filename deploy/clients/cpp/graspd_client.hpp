@@ -231,7 +231,7 @@ struct Options {
     std::optional<bool> same_computer = {};
     std::optional<Keys> keys = {};
     // A `stable` with this `p_slip` or more counts as unknown. Pass the scene's `slip_threshold` if
-    // that is higher.
+    // it is above 0.5.
     double max_p_slip = 0.5;
     // Called for allowed lifts whose outcome was not reported: for the first and every ten later.
     std::function<void(const std::string&)> warn = [](const std::string& text) {

@@ -281,14 +281,16 @@ class _Hand:
         keys: Keys | None = None,
         max_p_slip: float = 0.5,
     ) -> None:
-        """`max_age_ms`: largest age of a reading that permits a lift, ms.
+        """`endpoint`: address of verdicts in the scene's `[publish]`. `hand`: `right` or `left`.
+
+        `max_age_ms`: largest age of a reading that permits a lift, ms.
 
         `ask_endpoint` (`[ask]`): socket at which `may_i_lift` asks for a judgement and `tell`
         reports. `same_computer`: True if the daemon's monotonic clock is also the client's. None:
         True for `ipc://` and loopback addresses, so pass False for a tunnel. `max_p_slip`: a
         `stable` with this `p_slip` or more counts as unknown; pass the scene's `slip_threshold` if
-        that is higher. Raises `zmq.ZMQError` for a wrong endpoint, `TypeError` for one that is not
-        text, and `ValueError` for an invalid age or probability.
+        it is above 0.5. `keys`: None for no encryption. Raises `zmq.ZMQError` for a wrong endpoint,
+        `TypeError` for one that is not text, and `ValueError` for an invalid age or probability.
         """
         for name, text in (("endpoint", endpoint), ("hand", hand), ("ask_endpoint", ask_endpoint)):
             if not isinstance(text, str) and (name, text) != ("ask_endpoint", None):
@@ -756,7 +758,8 @@ class Newest:
     def __init__(
         self, topic: bytes, max_age_ns: int, same_computer: bool, max_p_slip: float = 0.5
     ) -> None:
-        """`topic`: the hand's topic; messages with another are ignored."""
+        """`topic`: the hand's topic; messages with another are ignored. `max_age_ns`: largest age
+        of a reading that permits a lift, ns. `same_computer`, `max_p_slip`: those of the client."""
         self.counts = Counts()
         self.passed: set[tuple[str, FingerState | None]] = set()
         """State of each finger in the messages of the last look."""

@@ -103,7 +103,8 @@ class GraspScript:
         durations: Durations,
         rng: np.random.Generator,
     ) -> None:
-        """`rest`: counts of the untouched fingers, shape (fingers, 24)."""
+        """`rest`: counts of the untouched fingers, shape (fingers, 24). `grasp`: its number.
+        `start_s`: time when the hand begins to approach."""
         self._deviation = end_point.counts - rest
         fingers = len(rest)
         touched = _touches(fingers, start_s + rng.uniform(*durations.approach_s), durations, rng)

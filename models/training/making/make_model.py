@@ -190,8 +190,10 @@ def _never_seen(trained: Trained, contract: ModelContract, seed: int) -> dict[st
 
 
 def _data_sources(files: Sequence[Dataset]) -> dict[str, object]:
-    """Return licence and sources of the tables used for training or judging. They do not apply to
-    the files under `not_published`, which differ from the published ones."""
+    """Return licence and sources of the tables used for training or judging, for a card.
+
+    `not_published` of the result: files to which they do not apply, as these are not published.
+    """
     not_published = unpublished(files)
     sources: dict[str, object]
     if len(lab_table_names(files)) == len(files):

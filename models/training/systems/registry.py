@@ -172,7 +172,10 @@ def cnn(
     augmentation: Augmentation | None = None,
     takes: ImageInput = IMAGE,
 ) -> System:
-    """Return a system: a convolutional network on tactile images, with the paper's figures."""
+    """Return a system of a convolutional network on tactile images.
+
+    `published`: its results in the paper. `takes`: how its images are made.
+    """
     return System(name, takes, network, recipe, augmentation, published=published)
 
 

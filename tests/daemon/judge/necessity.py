@@ -174,7 +174,7 @@ class Necessity:
         return bool(((same | flagged).all(axis=1) & ~flagged.all(axis=1)).any())
 
     def _comes_again(self, counts: NDArray[np.uint16], flagged: NDArray[np.bool_]) -> bool:
-        """Return True if a finger without flags has the same counts as in a recent sweep."""
+        """Return True if any finger without flags has exactly its counts of a recent sweep."""
         now = [
             None if flags.any() else sweep.tobytes()
             for sweep, flags in zip(counts, flagged, strict=True)

@@ -124,7 +124,7 @@ class Model:
 
 
 class Lives(RuleBasedStateMachine):
-    """A daemon that starts and ends in random steps, each compared with `Model`."""
+    """A daemon that starts and ends in random steps, each compared with the simulation `Model`."""
 
     full: list[bool]
     """One item: True if the disk refuses to write."""
@@ -260,7 +260,7 @@ def outcomes_in(kept: KeptSession) -> int:
     return 0 if kept.trust is None else kept.trust.learner.outcomes
 
 
-def test_sessions_after_many_restarts_are_as_the_model_expects(
+def test_sessions_after_many_restarts_equal_those_of_a_simulation(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     full = [False]

@@ -57,7 +57,7 @@ def test_a_late_sample_is_placed_unless_its_sweep_has_ended(at: int, distance: i
     assert all(not reading.faults.any() for n, reading in enumerate(readings) if n != 6)
 
 
-def test_a_cut_is_counted_if_a_sample_came_before() -> None:
+def test_only_a_sweep_with_samples_counts_as_cut() -> None:
     sweeps, counters = assembler()
     sweeps.cut()
     assert counters.cut_sweeps == 0

@@ -35,7 +35,8 @@ FILE = Path("hand.toml")
 
 
 def degrees(calibration: JointCalibration, **raws: int | tuple[int, ...]) -> dict[str, float]:
-    """Angles of all joints, degrees, for raw values of the given ones; THJ5 and WRJ1 take two."""
+    """Return the angles of all joints, degrees. `raws`: sensor values of some, by joint; THJ5 and
+    WRJ1 have two each. The other sensors read 1."""
     words = {"FFJ1": 0, "FFJ2": 1, "FFJ3": 2, "FFJ4": 3, "LFJ5": 16, "THJ1": 17, "THJ2": 18,
              "THJ4": 20, "THJ5": 21, "WRJ1": 23, "WRJ2": 25}  # fmt: skip
     sensors = [1] * 37

@@ -196,9 +196,7 @@ def test_a_packet_ten_cycles_overdue_means_a_lost_round(after_ns: int, lost: int
     ("after_ns", "missed"),
     [(13 * MS, 0), (14 * MS, 1), (2_000 * MS, 142), (2_000 * MS + 1, 1)],
 )
-def test_rounds_missed_by_an_interruption_count_up_to_two_seconds(
-    after_ns: int, missed: int
-) -> None:
+def test_missed_rounds_are_counted_but_over_two_seconds_as_one(after_ns: int, missed: int) -> None:
     sweeps = PalmStream(FINGERS)
     stream = packets(2)
     sweeps.interrupt()
@@ -271,7 +269,7 @@ def test_an_equal_packet_too_soon_to_be_new_is_dropped(
 
 
 def test_a_late_copy_in_its_round_begins_no_round() -> None:
-    """By its position, a copy 8 to 12 ms late could be 6 to 2 packets ahead of the last one."""
+    """A round has 14 packets, so a copy 8 to 12 ms late looks like a packet 6 to 2 ahead."""
     for late_ms in range(1, 13):
         stream = PalmStream(FINGERS)
         data = [packet.to_bytes() for packet in packets(2)]

@@ -98,7 +98,9 @@ def test_labels_of_the_judged_session_do_not_change_verdicts(rows: pd.DataFrame)
     assert same(rows, judged(SESSION_JOB, dataclasses.replace(GRASPS, slipped=slipped)))
 
 
-def test_only_a_session_system_is_judged_in_several_ways(rows: pd.DataFrame) -> None:
+def test_only_a_session_system_in_session_protocols_has_several_variants(
+    rows: pd.DataFrame,
+) -> None:
     assert set(rows["variant"]) == set(SESSION_VARIANTS)
     assert set(rows["variant"][rows["age"].notna()]) == {"running", "running-sorted"}
     assert rows["refused"].isna().all()
