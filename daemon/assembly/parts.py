@@ -82,7 +82,8 @@ class Assembly:
         self._tap: Tap | None = None
 
     def open_sockets(self, high_water_mark: int | None = None) -> Sockets:
-        """Open the scene's sockets until the stack closes. `high_water_mark`: see `Sockets`."""
+        """Open the scene's sockets until the stack closes. `high_water_mark`: most messages that
+        wait for a subscriber; None: the default."""
         from graspd.daemon.publish.sockets import Sockets
 
         sockets = Sockets(self._parts.scene, high_water_mark=high_water_mark)

@@ -131,7 +131,8 @@ class Outbox:
         *,
         boot_id: str | None = None,
     ) -> None:
-        """`clock` returns monotonic ns, `wall_clock` seconds since 1970.
+        """`hand`: its name in the topics. `model`, `model_sha256`: name and checksum of the model.
+        `outputs`: get each message. `clock` returns monotonic ns, `wall_clock` seconds since 1970.
 
         `boot_id`: id of this start in all messages; None: a new one.
         """

@@ -100,8 +100,9 @@ class Recorder(Companion):
         """Start the thread, which creates the first file.
 
         `take_header`: copies session and learning for a file's header. It is called here and after
-        a status, when no reading is being judged. `patience_s`: longest wait for a slow disk in
-        `close` (at least `CLOSE_S`) and in `ReplayRecorder`.
+        a status, when no reading is being judged. `tap`: gives the link's traffic; None: it is not
+        recorded. `patience_s`: longest wait for a slow disk in `close` (at least `CLOSE_S`) and in
+        `ReplayRecorder`. `clock`: monotonic ns. `wall_clock`: ns since 1970.
         """
         self._options = options
         self._hand = hand

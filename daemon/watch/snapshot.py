@@ -74,7 +74,7 @@ class FingerImage(msgspec.Struct, frozen=True, kw_only=True):
     from_rest: bool
     """True if levels are relative to the resting counts, False: to the finger's median."""
     levels: list[int]
-    """Level of each pixel, 12 rows of 11; see `levels_of`."""
+    """Level of each pixel, 12 rows of 11, as `levels_of` returns them."""
     deepest: int
     """Largest fall of an electrode, counts."""
     marked: list[int]
@@ -141,6 +141,6 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     learning: list[Line]
     timing: list[Line]
     history: list[str]
-    """Tones of the last 300 seconds, the oldest first; see `TONE_CODE`."""
+    """Tones of each of the last 300 seconds, the oldest first, as letters of `TONE_CODE`."""
     history_p: list[int]
     """Highest probability of slip in each second of `history`, %; -1: none."""

@@ -152,7 +152,8 @@ class Fitted:
     def __init__(
         self, head: RenderableType, wrong: RenderableType, rest: RenderableType, page: int
     ) -> None:
-        """`wrong`: lines on what is wrong, which are counted separately when cut off."""
+        """`wrong`: lines on what is wrong, above `rest`, which are counted separately when cut off.
+        `page`: number of the page to show, from 0; after the last one the first follows."""
         self._parts = head, wrong, rest
         self._page = page
 

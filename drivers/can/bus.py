@@ -61,8 +61,9 @@ class CanBus:
         wall_clock: Callable[[], int],
         options: Options = MappingProxyType({}),
     ) -> None:
-        """`bitrate`: bit/s; None: the interface's default. `options`: its other arguments. Raises
-        `ValueError` for arguments with which no bus can ever be opened."""
+        """`interface`, `channel`: python-can's names. `bitrate`: bit/s; None: the interface's
+        default. `clock`: monotonic ns. `wall_clock`: ns since 1970. `options`: other arguments of
+        the interface. Raises `ValueError` for arguments with which no bus can ever be opened."""
         refuse_unusable(interface, channel, bitrate, options)
         self.failure: LinkError | None = None
         """Error that broke the bus; None while it works."""

@@ -54,10 +54,11 @@ class CanBridgeDriver(Opened):
         wall_clock: Callable[[], int] = time.time_ns,
         **board: Unpack[BoardOptions],
     ) -> None:
-        """`fingers` and `board`: see `graspd.drivers.can.stream.CanStream`.
+        """`fingers`: the rows of a reading. `board`: the options of `CanStream` for the board.
 
-        `bitrate`: bit/s; not for socketcan, where `ip link` sets it. `options`: more arguments of
-        python-can's interface.
+        `bitrate`: bit/s; None for socketcan, where `ip link` sets it, or the interface's default.
+        `options`: more arguments of python-can's interface. `clock`: monotonic ns.
+        `wall_clock`: ns since 1970.
         """
         self._stamped = interface in STAMPED_INTERFACES
         self._make_stream = functools.partial(CanStream, f"{interface} {channel}", fingers, **board)

@@ -96,7 +96,7 @@ class PalmPacket:
     which_motors: int
     """Motors in this packet: 0 the even ones, 1 the odd ones."""
     tactile_type: int
-    """Type that tells the channels of `other_0` and `other_1`: see `position_of`."""
+    """Type of the tactile data; `position_of` returns the packet's position in the round for it."""
     tactile_valid: int
     """Bit i is set if slot i is valid: 0 first finger ... 4 thumb."""
     tactile: tuple[TactileSlot, ...]

@@ -161,8 +161,8 @@ class CanLog(LinkLogDriver[CanFrame]):
         clock: Callable[[], int] = time.monotonic_ns,
         **board: Unpack[BoardOptions],
     ) -> None:
-        """`channel`: bus to play if the logs have several. Others: see `RecordedDriver`,
-        `CanStream`. Raises `ValueError`."""
+        """`channel`: bus to play if the logs have several. `speed`: factor of real time; None: as
+        fast as possible. `board`: options of `CanStream`. Raises `ValueError`."""
         super().__init__(paths, speed, clock)
         self._fingers, self._board = fingers, board
         self._channel = None if channel is None else bus_name(channel)

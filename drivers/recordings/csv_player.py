@@ -79,7 +79,7 @@ class ReplayDriver(ReadingsDriver[tuple[Row, bool]]):
     ) -> None:
         """`layouts`: layout of each file, if known. `speed`: factor of real time; None: as fast as
         possible. `rate_hz`: rows per second of a file without times; None: 100 for a table.
-        `read_as`, `rate_hz`: see `layout_of`. `loop`: start again after the last file."""
+        `read_as`: what the rows are; None: find out. `loop`: start again after the last file."""
         super().__init__(paths, fingers, speed=speed, clock=clock)
         self._table_period_ns = _NS_PER_S / (rate_hz or TABLE_RATE_HZ)
         self._find = partial(layout_of, fingers=self._fingers, read_as=read_as, rate_hz=rate_hz)

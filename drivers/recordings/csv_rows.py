@@ -63,7 +63,8 @@ class Recording:
     def __init__(
         self, path: Path, file: BinaryIO, layout: Layout, *, strict: bool, outcomes: bool
     ) -> None:
-        """`file`: opened, at its start. `layout`: of this file."""
+        """`file`: opened, at its start. `layout`: of this file. `strict`, `outcomes`: True raises
+        for a value that is not a count, and for an unreadable outcome."""
         self._path = path
         self._strict = strict
         self._outcomes = outcomes
@@ -184,8 +185,9 @@ def read_rows(
     outcomes: bool = False,
     layout: Layout | None = None,
 ) -> Iterator[Row]:
-    """Yield the rows of a file: see `Recording`. `layout`: of this file, if it is known already.
+    """Yield the rows of a file. `layout`: of this file; None: find it out.
 
+    With `strict`, a value that is not a count raises; with `outcomes`, an unreadable outcome does.
     Raises `RecordingError`.
     """
     with open_recording(path) as file:

@@ -115,7 +115,7 @@ def survey(
     read_as: ReadAs | None = None,
     rate_hz: float | None = None,
 ) -> Layout:
-    """Return the layout of an opened file, and rewind it: see `layout_of`."""
+    """Return the layout of an opened file as `layout_of` does, and rewind the file."""
     cells = Cells(path, file)
     columns = Columns.of(path, cells.names, fingers, cells.header_line)
     rows = _Rows(path, columns, cells)

@@ -49,8 +49,9 @@ class CanTwin(Opened):
         faults: LinkFaults = LinkFaults(),  # noqa: B008 (immutable)
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """`fingers`: finger of each row of `counts`. `rate_hz`: sweeps per second of `serve`.
-        Raises `ValueError`, also for an interface that cannot be used here."""
+        """`counts`: of each sweep, shape (fingers, 24). `fingers`: finger of each of these rows.
+        `sequence`: a key of `SEQUENCES`. `rate_hz`: sweeps per second of `serve`. Raises
+        `ValueError`, also for an interface that cannot be used here."""
         if not 0.0 < rate_hz <= 1000.0:
             raise ValueError(f"rate_hz is {rate_hz}, must be above 0 and at most 1000")
         refuse_unusable(interface, channel, None, {})

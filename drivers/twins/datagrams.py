@@ -131,7 +131,8 @@ class PalmTwin(DatagramTwin):
         faults: LinkFaults = LinkFaults(),  # noqa: B008 (immutable)
         seed: int = 0,
     ) -> None:
-        """Raises `ValueError` for a fault that datagrams cannot have."""
+        """`fingers`: finger of each row of the counts. `seed`: of the noise of the Hall sensors.
+        Raises `ValueError` for a fault that datagrams cannot have."""
         faults.refuse("the palm", "one_byte_at_a_time")
         super().__init__(faults)
         self._counts = iter(counts)

@@ -75,8 +75,9 @@ class SpiTwin(Opened):
         clock: Callable[[], int] = time.monotonic_ns,
         tap: Callable[[bytes], None] | None = None,
     ) -> None:
-        """`tap`: called with all bytes to the host. Raises `ValueError` for a rate not above 0, a
-        source without counts, or an unknown channel."""
+        """`rate_hz`: sweeps/s. `channels`: those of each sweep, in order. `tap`: called with all
+        bytes to the host; None: nothing. Raises `ValueError` for a rate not above 0, a source
+        without counts, or an unknown channel."""
         if not rate_hz > 0.0:
             raise ValueError(f"rate_hz is {rate_hz}, must be positive")
         counts = iter(source)

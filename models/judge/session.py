@@ -28,7 +28,7 @@ class SessionCalibration:
     calibrated: bool
     """True if the session has as many grasps as the model requires, and is not `odd`."""
     odd: bool
-    """True if the session cannot have come from grasps of these fingers: see `is_odd`."""
+    """True if, by `is_odd`, the session cannot have come from grasps of these fingers."""
     temperature: float
     """Divisor of the network's log-odds of slip, above 1 while the session has few grasps."""
 

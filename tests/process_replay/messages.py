@@ -18,7 +18,7 @@ from tests.process_replay.verdicts import FOLDER, played
 NAMES: Final = ("request_risk", "slow", "spi_early")
 """Cases of `verdicts` whose messages are kept."""
 TOLERANCE: Final = 2e-4
-"""Largest difference of numbers with a point, absolute and relative; see `verdicts`."""
+"""Largest difference of numbers with a point, absolute and relative: processors differ."""
 
 _COUNTER: Final = re.compile(r'(?<="seq":)\d+|(?<="t_mono_ns":)\d+')
 _VERSIONS: Final = re.compile(r'(?<="(?:graspd|python)":)"[^"]*"|(?<="onnxruntime":)"[^"]*"')

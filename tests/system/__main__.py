@@ -99,7 +99,8 @@ def _write(mark: str, step: str, took: str, recovery: str, seen: str) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run all steps; return 0 if all succeed, 1 if one fails, 2 if the machine cannot be run."""
+    """Run all steps; return 0 if all succeed, 1 if one fails, 2 if the emulated machine cannot be
+    run."""
     parser = argparse.ArgumentParser(prog="python -m tests.system", description=__doc__)
     parser.add_argument(
         "--rebuild", action="store_true", help="build the image even if it is there"
@@ -138,7 +139,7 @@ def _run(folder: Path, rebuild: bool, table: Table) -> None:
 
 
 def _explain(machine: Machine) -> None:
-    """Write the end of the machine's journal and its failed units to stderr."""
+    """Write the end of the emulated machine's journal and its failed units to stderr."""
     with contextlib.suppress(MachineError):
         said = machine.run("journalctl -q --no-pager -n 60 -p notice; systemctl --failed").out
         sys.stderr.write(said + "\n")

@@ -1,4 +1,5 @@
-"""Parts that all steps share: the machine, the twins of both hands, and calls to ask and wait."""
+"""Parts that all steps share: the emulated machine, simulated links of both hands, and calls to
+ask and wait."""
 
 from __future__ import annotations
 
@@ -23,7 +24,7 @@ PAYLOAD: Final = "/payload"
 PYTHON: Final = "/opt/graspd/venv/bin/python"
 HANDS: Final = ("can", "serial")
 MEMBER, STRANGER = "member", "stranger"
-"""Users inside the machine: in the group graspd, and in none."""
+"""Users in the emulated machine: in the group graspd, and in none."""
 RATE_HZ: Final = 20.0
 """Sweeps/s of each hand: as many as two emulated processors can judge."""
 GRASPS: Final = Durations(first_rest_s=(6.5, 6.5), settle_s=(2.0, 2.0), rest_s=(6.5, 6.5))
@@ -35,7 +36,7 @@ LOOK_S: Final = 0.5
 
 
 class StepError(Exception):
-    """A step failed: something inside the machine is wrong; the message says what."""
+    """A step failed: something in the emulated machine is wrong; the message says what."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,20 +46,23 @@ class Outcome:
     what: str
     """What the step saw, in one line."""
     recovery_s: float | None = None
-    """Time from the fault to the first sound message, s, by the machine's clock; None: no fault."""
+    """Time from the fault to the first sound message, s, by the emulated machine's clock; None: no
+    fault."""
 
 
 class Lab:
-    """The machine, and calls for the steps: commands inside, the journal, messages of the hands."""
+    """The emulated machine, and calls for the steps: its commands, its journal, the messages of its
+    daemons, one for each hand."""
 
     def __init__(self, machine: Machine, bridge: Bridge) -> None:
         self.machine = machine
         self.bridge = bridge
         self.deeds_s: dict[str, float] = {}
-        """Times of what a step did and a later step awaits, by the machine's monotonic clock."""
+        """Times of what a step did and a later step awaits, s, by the emulated machine's monotonic
+        clock."""
 
     def sh(self, script: str, timeout_s: float = COMMAND_TIMEOUT_S) -> str:
-        """Run a shell script inside; return its output without the last line's end.
+        """Run a shell script in the emulated machine; return its output without the last newline.
 
         Raises `StepError` if it fails.
         """
@@ -69,17 +73,18 @@ class Lab:
         return done.out.rstrip("\n")
 
     def deed(self, script: str) -> float:
-        """Run a shell script inside; return when it began, s, by the machine's monotonic clock."""
+        """Run a shell script in the emulated machine; return when it began, s, by the monotonic
+        clock there."""
         return float(self.sh(f"read now _ < /proc/uptime; echo $now\n{script}").split()[0])
 
     def done_s(self, what: str) -> float:
-        """Return the time of `deeds_s` of an earlier step. Raises `StepError` if there is none."""
+        """Return the time that an earlier step noted as `what`. Raises `StepError` if none did."""
         if what not in self.deeds_s:
             raise StepError(f"{what}: the step that does it did not come so far")
         return self.deeds_s[what]
 
     def now_s(self) -> float:
-        """Return the time of the machine's monotonic clock, s."""
+        """Return the time of the emulated machine's monotonic clock, s."""
         return self.deed(":")
 
     def show(self, hand: str, what: str) -> str:
@@ -125,7 +130,8 @@ class Lab:
     ) -> Message:
         """Return the first message of a hand after `after_s` for which `wanted` is True.
 
-        None: a verdict on a reading. `what`: its name in the `StepError` if none comes in time.
+        `wanted` None: a verdict on a reading. `what`: words for the `StepError` that it raises if
+        none comes in `timeout_s`.
         """
 
         def fits(message: Message) -> bool:
@@ -170,7 +176,8 @@ class Lab:
         return found
 
     def observe(self) -> None:
-        """Start observe.py inside, as a member of the group, for both hands."""
+        """Start guest/observe.py in the emulated machine, as a member of the group graspd, for both
+        hands."""
         endpoints = " ".join(f"ipc:///run/graspd/{hand}.ipc" for hand in HANDS)
         self.sh(
             f"systemd-run -q --unit=observer --uid={MEMBER} "
@@ -179,7 +186,7 @@ class Lab:
         )
 
     def twin(self) -> None:
-        """Start the CAN board's twin on vcan0; it plays a recording, as making grasps is slower."""
+        """Start a simulated CAN board on vcan0 that plays a recording: making grasps is slower."""
         self.sh(
             "systemd-run -q --unit=twin-can /usr/local/bin/graspd twin can "
             f"--interface socketcan --channel vcan0 --rate {RATE_HZ} "
@@ -198,7 +205,7 @@ class Lab:
 
 
 class Bridge:
-    """An SPI bridge's twin on a terminal of the host; the machine sees it as a USB adapter."""
+    """A simulated SPI bridge on a terminal of the host; the emulated machine sees a USB adapter."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

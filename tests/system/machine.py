@@ -1,4 +1,4 @@
-"""A machine emulated by QEMU: starts it, runs commands inside, unplugs its USB adapter."""
+"""A machine emulated by QEMU: starts it, runs commands in it, unplugs its USB adapter."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ ENVIRONMENT: Final = (
 
 
 class MachineError(Exception):
-    """The machine did not boot, run a command or answer in time; the message says what."""
+    """The emulated machine did not boot, run a command or answer in time; the message says what."""
 
 
 class ProtocolError(Exception):
@@ -124,7 +124,7 @@ class Done:
 
 
 class Machine:
-    """Runs during its `with` block; changes to its disk are discarded."""
+    """A machine that QEMU emulates during its `with` block; changes to its disk are discarded."""
 
     def __init__(self, image: Image, payload: Path, serial: Path, folder: Path) -> None:
         """`payload`: image of a second disk. `serial`: terminal of the host, where the USB adapter
@@ -189,7 +189,8 @@ class Machine:
         self._in_step = True
 
     def run(self, script: str, timeout_s: float = COMMAND_TIMEOUT_S) -> Done:
-        """Run a shell script inside, as root. Raises `MachineError` if it does not end."""
+        """Run a shell script in the machine, as root. Raises `MachineError` if it does not end in
+        `timeout_s`."""
         deadline_s = time.monotonic() + timeout_s
         pid = self._begin(script)
         for look in range(1_000_000):
@@ -218,7 +219,7 @@ class Machine:
         )
 
     def _begin(self, script: str) -> int:
-        """Begin a shell script inside; return its process id there."""
+        """Begin a shell script in the machine; return its process id there."""
         if not self._in_step:
             self.wait_for_agent()
         started = self._ask(

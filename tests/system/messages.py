@@ -25,7 +25,7 @@ class Message:
     """One message of a daemon."""
 
     t_s: float
-    """Time of arrival, s, by the machine's monotonic clock."""
+    """Time of arrival, s, by the emulated machine's monotonic clock."""
     kind: str
     """`verdict`, `gate` or `status`."""
     hand: str

@@ -1,4 +1,4 @@
-"""The machine's second disk: wheels, `deploy/`, and the programs that run inside."""
+"""The emulated machine's second disk: wheels, `deploy/`, and the programs that run there."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.system.lab import GRASPS, RATE_HZ
 PROJECT: Final = Path(__file__).parents[2]
 GUEST: Final = Path(__file__).parent / "guest"
 GUEST_PYTHON: Final = (3, 11)
-"""Version of Python in the machine, and so of the Python that makes its wheels."""
+"""Version of Python in the emulated machine, and so of the Python that makes its wheels."""
 EXTRA: Final = "record"
 """Extra of the package that the scenes need."""
 RECORDED: Final = 6

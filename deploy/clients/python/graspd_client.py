@@ -268,7 +268,7 @@ class Keys(NamedTuple):
 
 
 class _Hand:
-    """Base of both clients: verdicts of one hand. Its calls do not wait themselves: see `Waits`."""
+    """Base of both clients: verdicts of one hand. Its calls return `Waits`, which subclasses run."""
 
     def __init__(
         self,

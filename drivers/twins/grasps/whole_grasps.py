@@ -87,7 +87,8 @@ class WholeGrasps:
     ) -> None:
         """Raises `ValueError` for a wrong rate.
 
-        `rest`: untouched counts, shape (fingers, 24). `held`: see `Sampler`. `noise`: makes the
+        `rest`: untouched counts, shape (fingers, 24). `end_points`: what each grasp ends in. `held`:
+        2 of 7 rows repeat values, as in recordings at 100 Hz. `rate_hz`: rows/s. `noise`: makes the
         noise of a number of fingers; None: `MeasuredNoise`. `loop`: repeat the end points for ever.
         """
         if not 0.0 < rate_hz < float("inf"):

@@ -1,1 +1,1 @@
-"""Attacks that hostile peers may try on a daemon, and their results: see `__main__`."""
+"""Attacks that hostile peers may try on a daemon, and their results; run by `__main__`."""

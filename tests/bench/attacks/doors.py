@@ -140,7 +140,8 @@ def hand(
 ) -> Iterator[Hand]:
     """Run a daemon that replays the demo table, without an attack yet.
 
-    On Unix sockets, on TCP if `tcp`, and on TCP with keys if `curve`; others: see `running`.
+    On Unix sockets, on TCP if `tcp`, and on TCP with keys if `curve`. `high_water_mark`: most
+    messages that wait for a subscriber; None: the daemon's own limit.
     """
     endpoint, questions = f"ipc://{folder}/v", f"ipc://{folder}/ask"
     section, keys = "", None

@@ -42,7 +42,7 @@ def poses() -> tuple[Counts, list[Counts]]:
 
 
 class Fault:
-    """A fault of the sensors that lasts `ms` from now, or a drawn time; see `FAULTS`."""
+    """A fault of the sensors, of a `kind` in `FAULTS`, that lasts `ms` from now; None: drawn."""
 
     def __init__(self, kind: str, world: World, ms: int | None = None) -> None:
         draw = world.random

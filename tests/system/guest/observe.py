@@ -1,4 +1,4 @@
-"""Runs inside the machine: writes each message of the daemons, with its arrival, to stdout."""
+"""Runs in the emulated machine: writes each daemon's messages, with their arrival, to stdout."""
 
 from __future__ import annotations
 
