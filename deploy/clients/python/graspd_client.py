@@ -268,7 +268,7 @@ class Keys(NamedTuple):
 
 
 class _Hand:
-    """Base of both clients: verdicts of one hand. Its calls return `Waits`, which subclasses run."""
+    """Base of both clients: verdicts of one hand. Its calls are `Waits` that subclasses run."""
 
     def __init__(
         self,

@@ -87,7 +87,7 @@ class WholeGrasps:
     ) -> None:
         """Raises `ValueError` for a wrong rate.
 
-        `rest`: untouched counts, shape (fingers, 24). `end_points`: what each grasp ends in. `held`:
+        `rest`: untouched counts, shape (fingers, 24). `end_points`: those of the grasps. `held`:
         2 of 7 rows repeat values, as in recordings at 100 Hz. `rate_hz`: rows/s. `noise`: makes the
         noise of a number of fingers; None: `MeasuredNoise`. `loop`: repeat the end points for ever.
         """
