@@ -15,7 +15,7 @@ ROOT: Final = Path(__file__).parents[1]
 RESULTS: Final = (ROOT / "models/RESULTS.md").read_text()
 CARDS: Final = {name: zoo.card(name) for name in zoo.names()}
 WORTH: Final[Mapping[str, Any]] = CARDS["small-session"]["worth"]
-"""Figures of `graspd report worth` for this model."""
+"""Figures of `graspd report worth` for `small-session`, on its card."""
 PUBLISHED: Final = "published: loops, Keras predict"
 """Row of the published code, which runs the weights of `cnn1` and judges as graspd does."""
 PROTOCOLS: Final = {

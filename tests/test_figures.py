@@ -24,7 +24,7 @@ def drawn(drawing: str, title: str) -> Rows:
     return table((ROOT / "deploy" / f"{drawing}.svg").read_text(), title)[1]
 
 
-def test_the_worth_picture_has_the_figures_of_its_table() -> None:
+def test_the_picture_worth_svg_has_the_figures_of_its_table() -> None:
     title = "slips among `stable` / good lifts kept"
     titles, rows, _ = table(MEASURED, title)
     every, points, _ = table((ROOT / "deploy/worth.svg").read_text(), title)

@@ -13,19 +13,19 @@ ALL = [(kind, name) for kind in KINDS for name in KINDS[kind].NAMES]
 
 
 @pytest.mark.parametrize(("kind", "name"), ALL)
-def test_known_input_gets_the_answer_of_its_reference(kind: str, name: str) -> None:
+def test_known_input_gives_the_output_stored_in_its_reference_file(kind: str, name: str) -> None:
     net = KINDS[kind]
     found = net.differences(net.path_of(name).read_text(), net.made(name))
     advice = "if that is meant, `python -m tests.process_replay --renew`"
     assert not found, "\n".join([*found[:SHOWN_MAX], advice])
 
 
-def test_every_reference_is_compared() -> None:
+def test_every_stored_reference_file_is_compared() -> None:
     known = {net.path_of(name) for net in KINDS.values() for name in net.NAMES}
     assert set(verdicts.FOLDER.rglob("*.*")) == known
 
 
-def test_every_reference_judges_some_grasp() -> None:
+def test_every_stored_verdict_reference_has_a_judged_grasp() -> None:
     for name in verdicts.NAMES:
         assert any(entry["judged"] and entry["valid"] for entry in reference(name)), name
     said = {entry["verdict"] for entry in reference("demo")}

@@ -100,10 +100,11 @@ def feel(
     begins: bool = False,
     slide_spread: float = SLIDE_SPREAD,
 ) -> Felt:
-    """Play a generated hand to the gate, and return what that says.
+    """Play a generated hand to the gate, and return what the gate says.
 
-    The object slides along the fingers in `sliding` from the start, or from a drawn time after
-    closing if `begins`. `held`: sweeps as a palm holds them.
+    The object slides along the fingers that are True in `sliding` from the start, or from a drawn
+    time after closing if `begins`. `held`: sweeps as a palm holds them. `slide_spread`: how much
+    slides differ in speed; 0: not at all.
     """
     rng = np.random.default_rng([seed, 4])
     closed_s = REST_S + CLOSES_S

@@ -101,7 +101,10 @@ def own(what: str, folder: Path) -> Child:
 
 
 def turn(way: Way, hands: int, seconds: float) -> list[int]:
-    """Measure for `seconds`; return each sweep's time from line to subscriber, of all hands, ns."""
+    """Measure `hands` hands for `seconds`, each with an echo or a daemon, as `way` says.
+
+    Return each sweep's time from line to subscriber, of all hands, ns.
+    """
     with tempfile.TemporaryDirectory() as root, ExitStack() as stack:
         folders = [Path(root) / f"hand{hand}" for hand in range(hands)]
         twins = []

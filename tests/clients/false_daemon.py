@@ -25,7 +25,7 @@ Answer = Callable[[dict[str, Any]], list[bytes]]
 
 
 def told(**change: object) -> Answer:
-    """Answer with the message published last, with these fields changed."""
+    """Answer with the message published last, with the fields `change` replaced."""
     return lambda published: [json.dumps(published | change).encode()]
 
 

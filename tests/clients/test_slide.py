@@ -21,7 +21,8 @@ HELD: Words = {"ff": "touch", "th": "touch"}
 
 
 def lift(*words: Words | None, **more: object) -> list[tuple[int, list[bytes]]]:
-    """Make messages, one every 10 ms, each with these states of the fingers; None: without."""
+    """Make messages, one every 10 ms. `words`: the fingers' states in each; None: without states.
+    `more`: other fields of all."""
     told = ({} if felt is None else {"fingers": felt} for felt in words)
     return coming(*(("unknown", each | more) for each in told))
 
@@ -39,7 +40,7 @@ def test_a_slide_stops_the_lift_at_once() -> None:
 
 
 def waiting(sent: list[tuple[int, list[bytes]]]) -> list[tuple[int, list[bytes]]]:
-    """Return the messages, but the sixth to ninth arrive together, for one look of the client."""
+    """Return messages whose sixth to ninth arrive together, as if the client had not looked."""
     late_ns = sent[8][0]
     return sent[:5] + [(max(at_ns, late_ns), message) for at_ns, message in sent[5:]]
 

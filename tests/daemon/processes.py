@@ -59,7 +59,7 @@ class Started(subprocess.Popen[str]):
 
 
 def graspd_with(module: str, **constants: object) -> tuple[str, ...]:
-    """Words that start `graspd` with these values for constants of the module named `module`."""
+    """Words that start `graspd` after `constants` of the module named `module` are replaced."""
     return (sys.executable, "-c", WITH_CONSTANTS, f"{module}:{constants!r}")
 
 

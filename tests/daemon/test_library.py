@@ -30,7 +30,7 @@ PAGE = (ROOT / "deploy" / "LIBRARY.md").read_text()
 
 
 def messages(*words: object) -> list[dict[str, Any]]:
-    """The verdicts that `graspd replay` prints as JSON."""
+    """The verdicts that `graspd replay` with the arguments `words` prints as JSON."""
     done = inside.graspd("replay", *words, "--json")
     return [json.loads(line) for line in done.stdout.splitlines()]
 

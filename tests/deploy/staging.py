@@ -37,13 +37,14 @@ def wheelhouse(folder: Path, version: str, *, starts: bool = True) -> Path:
 
 
 def installer(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    """Run install.sh with these arguments, and this Python for its virtual environment."""
+    """Run install.sh with `arguments`, and with this Python for its virtual environment."""
     command = [str(part) for part in (INSTALLER, "--python", sys.executable, *arguments)]
     return subprocess.run(command, check=False, capture_output=True, text=True, timeout=TIMEOUT_S)
 
 
 def install(root: Path, wheels: Path, *arguments: str) -> str:
-    """Install below `root` from the folder `wheels`; return the installer's output."""
+    """Install below `root` from the folder `wheels`; return the installer's output. `arguments`:
+    further ones of install.sh. Fails if the installer does."""
     done = installer("--root", root, "--wheelhouse", wheels, *arguments)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout

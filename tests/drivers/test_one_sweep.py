@@ -199,7 +199,7 @@ class Assembler:
 
 ALL = [range(24)]
 PALM_SHIFT = 37
-"""Packets that a restart of the relay skips; it starts again within a round."""
+"""Packets skipped by a restart of what sends the palm's packets; it begins within a round."""
 PAIRS = [[], [0], *([first, first + 1] for first in range(1, 22, 2)), [23]]
 """Electrodes of each request of a round (tactile_data_type 0x0001, 0x0003 ... 0x001B)."""
 

@@ -37,7 +37,7 @@ class Bench:
         self.counters = self.link.stream.counters
 
     def hear(self, *sent: Datagram) -> list[int]:
-        """Let these datagrams arrive; return the ages of their readings, ns."""
+        """Let the datagrams `sent` arrive; return the ages of their readings, ns."""
         self.sockets[0].waiting += sent
         return [self.clock.now_ns - reading.t_ns for reading in joints(self.link.read_ready())]
 
@@ -280,7 +280,7 @@ def test_a_step_of_the_wall_clock_makes_no_datagram_younger(
     assert ages == [age_ms * 1_000_000] * 2
 
 
-def test_an_overlong_datagram_is_cut_to_limit_plus_one(
+def test_an_overlong_datagram_is_truncated_to_limit_plus_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     receiver, _ = noted(monkeypatch, (bytes(100), []), (bytes(500), []), (b"a", []))

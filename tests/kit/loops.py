@@ -72,7 +72,8 @@ class LoopBench(Companion):
         timing: LoopTiming | None = None,
         cost_ns: Callable[[], int] | None = None,
     ) -> None:
-        """Without `stop` the bench has one of its own, which `run` closes.
+        """`stop` None: the bench has one of its own, which `run` closes. `keep`: calls its
+        argument once all outcomes are on the disk. `timing` replaces `max_age_ms` and `sleep`.
 
         With `cost_ns` time stands still except in waits and by its result, ns, for each verdict.
         """

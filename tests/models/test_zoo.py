@@ -26,7 +26,7 @@ def test_cnn1_reaches_the_published_f1_within_its_spread() -> None:
     assert CARD["contract"]["measured"][0]["folds"] == 10
 
 
-def test_each_card_is_about_the_file_beside_it() -> None:
+def test_each_card_describes_the_model_file_beside_it() -> None:
     for name in zoo.names():
         model, card = TactileModel(zoo.find(name)), zoo.card(name)
         file, contract = card["file"], card["contract"]
@@ -83,7 +83,7 @@ def test_the_contract_names_the_data_and_its_range(bts3_dir: Path) -> None:
     assert seen["margin"] == 100
 
 
-def test_every_model_knows_the_grasps_of_its_training(bts3_dir: Path) -> None:
+def test_every_zoo_model_recognises_exactly_its_training_grasps(bts3_dir: Path) -> None:
     grasps = read_all(bts3_dir)
     tables = np.array([file.name for file in grasps.files])[grasps.table_of]
     for name in zoo.names():

@@ -97,7 +97,7 @@ def as_everywhere(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def below(names: set[str], modules: tuple[str, ...]) -> list[str]:
-    """Modules that are one of these, or below one."""
+    """Those of `modules` that are in `names`, or below a module in `names`."""
     return [m for m in modules if any(m == name or m.startswith(name + ".") for name in names)]
 
 

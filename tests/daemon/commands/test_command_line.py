@@ -133,7 +133,7 @@ def test_the_version_option_prints_python_and_library_versions_too() -> None:
 
 
 def on_a_terminal(setting: dict[str, str], *arguments: str) -> bytes:
-    """What a command with these environment variables writes to a terminal."""
+    """What graspd with `arguments` writes to a terminal; `setting`: added to the environment."""
     own, terminal = os.openpty()
     environment = {**os.environ, "TERM": "xterm", "NO_COLOR": "", **setting}
     with subprocess.Popen(

@@ -109,7 +109,8 @@ class Hand:
         limits: Limits = Limits(),  # noqa: B008 (frozen)
         moved_counts: float = MOVED_COUNTS,
     ) -> None:
-        """`build` makes the pipeline, with the same `gate` and `limits`; None: `fakes.pipeline`."""
+        """`build` makes the pipeline, with the same `gate` and `limits`; None: `fakes.pipeline`.
+        `moved_counts`: mean change of a finger's counts that is certainly motion."""
         self.model, self.clock, self.limits = FakeModel(), Clock(), limits
         self.pipeline = (
             pipeline(self.model, self.clock, hand=gate)

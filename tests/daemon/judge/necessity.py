@@ -89,6 +89,8 @@ class Necessity:
         moved_counts: float = MOVED_COUNTS,
     ) -> None:
         """`rest`: resting counts, shape (fingers, 24), also those before the first reading.
+        `required`: fingers that must touch. `still_ms`: least time of touch and stillness, ms.
+        `moved_counts`: mean change of a finger's counts that is certainly motion.
 
         A gap has one limit, `GAP_MS`: no key of a scene changes that.
         """

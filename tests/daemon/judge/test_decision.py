@@ -57,7 +57,12 @@ def expected(
     against_stable: Reason | None,
     doubt: Decision,
 ) -> tuple[str, set[Reason]]:
-    """Return decision and reasons by the rule: unless everything is well, it is `unknown`."""
+    """Return decision and reasons by the rule: unless everything is well, it is `unknown`.
+
+    `worth`: what the probability says, as in `PROBABILITIES`. `fresh`: the reading is not too old.
+    `health`, `gate`: reasons of each. `well`: the grasp has settled. `against_stable`: reason of
+    the risk that forbids `stable`; None: none. `doubt`: decision of a `HoldDown` on the grasp.
+    """
     against = set(health)
     if worth.endswith("stable") and doubt is Decision.UNKNOWN and against_stable is None:
         against |= {Reason.LOW_CONFIDENCE}

@@ -89,7 +89,7 @@ KEYS = {
 
 
 def scene_of(values: Mapping[str, Any]) -> scenes.Scene:
-    """Return a scene of a live hand with these values, by `section.key`."""
+    """Return a scene of a live hand with `values`, by `section.key`."""
     given: Keys = {
         "model": {"slip_threshold": 0.999},
         "tactile": {"driver": "spi", "port": "x"},
@@ -102,7 +102,7 @@ def scene_of(values: Mapping[str, Any]) -> scenes.Scene:
 
 
 def run(values: Mapping[str, Any], seed: int) -> int:
-    """Return the number of `stable` with these keys; -1: the scene is refused, as it should be."""
+    """Return the number of `stable` with the keys `values`; -1: the scene is rightly refused."""
     try:
         plan = Plan.of(scene_of(values))
     except scenes.SceneError:

@@ -18,7 +18,7 @@ HANDS = {"small-session-th": ("th",), "small-session-ff-th": ("ff", "th")}
 
 
 def cut(source: Path, fingers: Sequence[str], folder: Path) -> Path:
-    """Copy a recording without the sensors of other fingers than these; return its path."""
+    """Copy a recording with no other sensors than those of `fingers`; return the copy's path."""
     path = folder / source.name
     with source.open(newline="") as whole, path.open("w", newline="") as part:
         rows = csv.DictReader(whole)

@@ -1,4 +1,4 @@
-"""The gate against a model, in random sequences: touch, motion, gaps, joints, questions, rest."""
+"""The gate against a simulation, in random order: touch, motion, gaps, joints, questions, rest."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class Felt:
 
 
 class Model:
-    """When a grasp settles, is judged and ends, as deploy/JUDGING.md says; times in ms."""
+    """Simulates when a grasp settles, is judged and ends, as deploy/JUDGING.md says; in ms."""
 
     def __init__(self, *, early: bool, on_request: bool) -> None:
         self.settles, self.on_request = 100 if early else 240, on_request
@@ -160,7 +160,7 @@ class Model:
 
 
 class Readings(RuleBasedStateMachine):
-    """Gives a gate and the model the same random readings and questions, and compares them."""
+    """Gives a gate and its `Model` the same random readings and questions, and compares them."""
 
     early: bool
     on_request: bool
@@ -246,7 +246,8 @@ class Readings(RuleBasedStateMachine):
             self.agree(found)
 
     def follow(self, objections: tuple[Reason, ...], change: float) -> bool:
-        """Update the model and `against`, the reasons against judging; True: it is settled."""
+        """Update the simulation, and `against`, the reasons against judging; return True if the
+        simulated grasp has settled."""
         model, felt, former = self.model, self.felt, self.model.touches
         within = felt.loose if model.sure else felt.strict
         model.now, model.touches = self.now, set(self.required) <= set(self.touching)
@@ -317,7 +318,7 @@ class Readings(RuleBasedStateMachine):
 
 @pytest.mark.parametrize("early", [False, True])
 @pytest.mark.parametrize("on_request", [False, True])
-def test_the_gate_agrees_with_its_model_on_random_sequences(
+def test_the_gate_agrees_with_a_simulation_on_random_sequences(
     monkeypatch: pytest.MonkeyPatch, on_request: bool, early: bool
 ) -> None:
     monkeypatch.setattr(Readings, "early", early, raising=False)

@@ -85,7 +85,7 @@ def test_under_a_risk_repeated_judging_brings_no_lucky_stable() -> None:
     assert trust.report().outstanding <= 1
 
 
-def test_outcome_told_is_not_a_reason_once_the_hand_opens() -> None:
+def test_the_reason_outcome_told_ends_when_the_hand_opens() -> None:
     hand = trusting(gate_limits(), None)
     hand.play(HELD)
     tell(hand, 1, slipped=False)

@@ -24,7 +24,7 @@ DEMO_SCENE = ROOT / "deploy" / "scenes" / "demo.toml"
 
 
 def python(code: str, *arguments: object) -> subprocess.CompletedProcess[str]:
-    """Run code, then graspd, in one process."""
+    """Run `code`, then graspd with `arguments`, in one process."""
     code += "\nimport sys\nfrom graspd.daemon.__main__ import main\nsys.exit(main())\n"
     return subprocess.run(
         [sys.executable, "-c", code, *map(str, arguments)],
@@ -156,7 +156,10 @@ def test_run_raises_the_soft_descriptor_limit_to_the_hard_one(tmp_path: Path) ->
 
 
 def redirected(redirection: str, *arguments: object, **environment: str) -> tuple[int, str, str]:
-    """Run graspd by a shell with a redirection; return exit code, output and errors."""
+    """Run graspd with `arguments` by a shell with a redirection, and with `environment` added.
+
+    Return exit code, output and errors.
+    """
     result = subprocess.run(
         ["sh", "-c", f'exec "$@" {redirection}', "sh", *GRASPD, *map(str, arguments)],
         capture_output=True,

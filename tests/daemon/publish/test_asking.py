@@ -273,7 +273,7 @@ class Questioning(RuleBasedStateMachine):
         assert self.loop.lifts.lifter == self.model.book.lifter
 
 
-def test_questions_in_any_order_are_answered_as_the_model_predicts(
+def test_questions_in_any_order_are_answered_as_a_simulation_predicts(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("graspd.daemon.publish.questions.WAITING_MAX", MOST)

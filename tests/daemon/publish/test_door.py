@@ -146,7 +146,9 @@ def test_answers_reach_the_newest_connection_of_a_routing_id(
         assert asker.recv_multipart() == [b"{}"]
 
 
-def test_a_message_of_many_frames_is_cut(asked: tuple[Door, str], peers: Peers) -> None:
+def test_only_the_first_frames_of_a_long_message_are_kept(
+    asked: tuple[Door, str], peers: Peers
+) -> None:
     door, endpoint = asked
     asker = peers.connect(zmq.DEALER, endpoint, name=b"controller")
     asker.send_multipart([b"x"] * 1000)

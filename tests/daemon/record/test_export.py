@@ -137,7 +137,7 @@ def test_of_grasps_with_the_same_counts_the_first_is_kept(tmp_path: Path) -> Non
     assert len(read_table(tmp_path / "a.csv").slipped) == 2
 
 
-def test_a_row_names_the_reported_object_else_the_given_one(
+def test_an_exported_grasp_without_object_gets_that_of_the_option(
     tmp_path: Path,
 ) -> None:
     writer = Writer(tmp_path / "a.mcap")

@@ -60,7 +60,8 @@ def header(*fingers: str, joints: bool) -> RecordingHeader:
 
 
 def write(path: Path, first: int = 0) -> None:
-    """Write readings of two fingers, 2 ms old when they are recorded; flush after every fifth."""
+    """Write `READINGS` readings of two fingers, numbered from `first`, 2 ms old when they are
+    recorded; flush after every fifth."""
     file = McapWriter(path, header("ff", "th", joints=True))
     for number in range(first, first + READINGS):
         t_ns = START_NS + number * PERIOD_NS
@@ -165,7 +166,7 @@ def test_a_finger_that_was_not_recorded_is_refused(tmp_path: Path) -> None:
 
 @given(st.integers(0, len(WHOLE) - 1))
 @settings(max_examples=200, deadline=None)
-def test_a_file_cut_anywhere_gives_what_was_flushed_before(at: int) -> None:
+def test_a_truncated_file_gives_what_was_flushed_before(at: int) -> None:
     try:
         found = read(WHOLE[:at])
     except RecordingError:

@@ -56,7 +56,7 @@ def in_fifths(messages: list[RecordedMessage]) -> list[RecordedMessage]:
 
 @given(st.randoms(use_true_random=False), st.integers(1, 20_000), st.booleans())
 @settings(max_examples=50, deadline=None)
-def test_shuffled_or_cut_files_are_read_in_time_order(
+def test_shuffled_or_truncated_files_are_read_in_time_order(
     random: Random, chunk: int, chunked: bool
 ) -> None:
     def shuffled(messages: list[RecordedMessage]) -> list[RecordedMessage]:

@@ -43,7 +43,8 @@ class Lab:
 
 
 def lab_of(folder: Path, **case: Any) -> Lab:  # noqa: ANN401
-    """Judge the demo recording, with a controller that asks and reports outcomes; record it."""
+    """Judge the demo recording, with a controller that asks and reports outcomes; record it.
+    `case`: other fields of `Case`."""
     sent = run(Case(readings=demo, joints=True, tells=True, asks=True, **case), folder / "record")
     return Lab(files(folder), sent)
 
@@ -83,7 +84,7 @@ def of_readings(path: Path) -> list[dict[str, Any]]:
 
 @cache
 def again(*arguments: object) -> list[dict[str, Any]]:
-    """Return the verdicts of `graspd replay --json` with these arguments, which runs once."""
+    """Return the verdicts of `graspd replay --json` with `arguments`; the same ones run once."""
     result = graspd("replay", "--json", *arguments)
     assert result.returncode == 0, result.stderr
     return [json.loads(line) for line in result.stdout.splitlines()]

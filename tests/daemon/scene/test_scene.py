@@ -138,7 +138,7 @@ def test_of_many_mistakes_twenty_are_listed(tmp_path: Path) -> None:
         GOOD + f"[publish]\nendpoint = 'tcp://{'x' * 100_000}:1'",
     ],
 )
-def test_a_long_value_is_cut_in_the_message(tmp_path: Path, text: str) -> None:
+def test_a_long_value_is_shortened_in_the_message(tmp_path: Path, text: str) -> None:
     path = written(tmp_path, text)
     with pytest.raises(SceneError) as error:
         load(path)

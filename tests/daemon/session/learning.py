@@ -136,7 +136,8 @@ class FakeJudge:
         read_rest: Callable[[], NDArray[np.float64]] | None = None,
         hear: Callable[[], object] = list,
     ) -> None:
-        """`part`: what learns. `hear`: called at each exchange."""
+        """`part`: what learns; None: nothing. `read_rest`: returns the resting counts of the open
+        hand. `hear`: called at each exchange."""
         self.session, self.trust, self.read_rest, self.hear = session, part, read_rest, hear
 
     def sensors_exchanged(self, known: Exchanged = NOTHING_KNOWN) -> None:

@@ -195,8 +195,8 @@ def test_a_hand_closed_at_start_continues_its_session_once_open(tmp_path: Path) 
     assert later.learner.state() == learned
 
 
-def test_a_relay_that_restarts_is_not_an_exchange(tmp_path: Path) -> None:
-    """The sensors behind it rest as before, although it sends from another port."""
+def test_another_sending_port_alone_is_not_an_exchange_of_sensors(tmp_path: Path) -> None:
+    """As when a program that forwards readings restarts: the sensors rest as before."""
     now, (session, part) = [PATTERN], taught()
     driver = sensors(**dict.fromkeys(FINGERS, "udp://192.0.2.1:4001"))
     with SessionFolder(tmp_path / "right") as folder:

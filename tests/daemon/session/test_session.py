@@ -93,7 +93,7 @@ GARBAGE: dict[str, Callable[[np.random.Generator], NDArray[np.generic]]] = {
 
 @pytest.mark.parametrize("what", GARBAGE)
 @pytest.mark.parametrize("grasps", [0, 100])
-def test_garbage_is_unknown_however_much_of_it_is_seen(
+def test_garbage_readings_stay_unknown_however_many_are_seen(
     bts3_dir: Path, what: str, grasps: int
 ) -> None:
     """All verdicts are `unknown`, both from the start and after real grasps."""

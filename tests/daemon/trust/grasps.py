@@ -30,7 +30,7 @@ def inputs(grasp: int) -> NDArray[np.float32]:
 
 
 def judge(part: Trust, grasp: int, margin: float = -6.0, boot: str = BOOT) -> bool:
-    """Judge and note a grasp; returns whether it was called stable."""
+    """Judge and note a grasp with `margin`, log-odds of slip; return True if it is `stable`."""
     name = named(grasp, boot)
     assessment = part.judge(name, sigmoid(margin), margin, inputs(grasp))
     stable = assessment.permission is Permission.ALLOWED and (assessment.p_slip or 0.0) < 0.5

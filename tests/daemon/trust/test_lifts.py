@@ -292,7 +292,7 @@ class Lifts(RuleBasedStateMachine):
         assert self.part.learner.state() == learner.state()
 
 
-def test_trust_agrees_with_a_plain_model_after_random_events(
+def test_trust_agrees_with_a_plain_simulation_after_random_events(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     decode(encode(Trust("model", INPUTS).state()))  # later tests read states of the usual size

@@ -49,7 +49,7 @@ def test_with_learning_off_outcomes_move_the_risk_alone() -> None:
     assert part.learner.state() == taught.learner.state()
 
 
-def test_stable_cannot_be_noted_where_it_was_not_allowed() -> None:
+def test_noting_stable_for_a_grasp_not_allowed_raises() -> None:
     for limits, margin in ((RULE, 3.0), (RiskLimits(0.1, warm_up=5), -0.5)):
         part = trust(limits)
         assessment = part.judge(named(0), 0.1, margin, inputs(0))

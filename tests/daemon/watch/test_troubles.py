@@ -45,7 +45,7 @@ def test_a_dead_link_does_not_look_like_a_dead_daemon() -> None:
     assert view.snapshot(301 * MS).why[0].what == "silent"
 
 
-def test_a_viewer_held_up_goes_by_the_times_in_messages() -> None:
+def test_a_delayed_viewer_dates_messages_by_their_own_times() -> None:
     """For 800 ms nothing was taken; the newest of 80 messages is 10 ms old, or 600."""
     for sent_ms, tone in ((790, Tone.STABLE), (200, Tone.SILENT)):
         view = a_view()
@@ -58,7 +58,7 @@ def test_a_viewer_held_up_goes_by_the_times_in_messages() -> None:
         assert view.snapshot(801 * MS).tone is tone
 
 
-def test_a_viewer_that_stood_still_says_so_itself() -> None:
+def test_a_viewer_that_was_suspended_reports_for_how_long() -> None:
     view = after((b"verdict.right", verdict(0, Decision.STABLE)))
     view.snapshot(0)
     view.stood_still = 20 * MS, 5020 * MS

@@ -49,7 +49,7 @@ def figures(lines: list[Line]) -> dict[str, str]:
     return {line.what: line.advice for line in lines}
 
 
-def test_before_the_first_message_it_is_unknown_and_says_why() -> None:
+def test_before_the_first_message_the_view_says_why_nothing_came() -> None:
     seen = a_view().snapshot(0)
     assert (seen.tone, seen.headline) == (Tone.SILENT, "no verdict yet")
     assert "is graspd running" in seen.why[0].advice
@@ -179,7 +179,9 @@ def test_a_verdict_without_a_calibrated_session_is_less_sure() -> None:
         ({"early": True}, "early: it may still slide"),
     ],
 )
-def test_a_stable_without_evidence_only_leans_to_it(change: dict[str, Any], why: str) -> None:
+def test_a_stable_without_evidence_is_shown_as_leans_to_stable(
+    change: dict[str, Any], why: str
+) -> None:
     """A target of 10 % needs ten lifts, of which one may slip."""
     assert seen_after(Decision.STABLE).tone is Tone.STABLE
     assert seen_after(Decision.STABLE, risk=risk(lifts=10, slips=1)).tone is Tone.STABLE

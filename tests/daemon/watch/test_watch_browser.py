@@ -89,7 +89,7 @@ def test_the_page_shows_verdict_images_and_advice(
 
 def test_unknown_motion_is_not_a_bar_of_zero(page: Page, talker: Talker, browser: Browser) -> None:
     def bars(*wanted: list[str]) -> str:
-        """Return a script: do the bars have this motion, share and text?"""
+        """Return a script: are motion, share and text of the bars in turn as in `wanted`?"""
         shown = "[...document.querySelectorAll('.moves:not([hidden])')]"
         parts = (
             "bar.dataset.motion, bar.style.getPropertyValue('--share'), bar.nextSibling.innerText"

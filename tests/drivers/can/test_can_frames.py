@@ -148,7 +148,7 @@ def test_every_dropped_sample_frame_is_counted_by_its_reason(frame: CanFrame, co
         CanFrame(0x7FF, E1_SAMPLE[:1] + bytes.fromhex("A250 A8C8 94B9")),  # even parity
     ],
 )
-def test_without_an_id_the_first_sound_sample_gives_it(unsound: CanFrame) -> None:
+def test_without_a_configured_id_the_first_sound_sample_sets_one(unsound: CanFrame) -> None:
     made, counters = decoder(None)
     made.push(unsound, 0)
     assert made.arbitration_id is None

@@ -100,7 +100,7 @@ def test_bus_off_loses_the_link_and_its_sweep(
             assert (counters.bus_off, counters.link_losses, counters.error_frames) == (1, 1, 1)
 
 
-def test_an_overflow_of_the_controller_cuts_the_sweep_there(socket_bus: SocketBus) -> None:
+def test_an_overflow_of_the_controller_ends_the_current_sweep(socket_bus: SocketBus) -> None:
     with over_socket() as driver:
         frames = sweep_of_frames(0)
         frames[3:5] = [CanFrame(0x004, bytes.fromhex("0001000000000000"), ERROR)]
@@ -122,7 +122,7 @@ def test_records_that_are_not_frames_are_counted(socket_bus: SocketBus) -> None:
         assert driver.counters.malformed_frames == 4
 
 
-def test_frames_dropped_by_the_kernel_cut_the_sweep_there(
+def test_frames_dropped_by_the_kernel_end_the_current_sweep(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Time does not show the loss: the clock stands still, and whole sweeps may be lost."""

@@ -85,7 +85,8 @@ def test_channels_that_the_sequence_lacks_are_counted() -> None:
 
 
 def periods(gaps_ns: Sequence[int]) -> list[int | None]:
-    """The period after each of these times between the ends of sweeps."""
+    """The period known after each of `gaps_ns`, times from sweep's end to sweep's end; None: none
+    yet."""
     clock, end_ns, known = SweepClock(range(24), 24), 10**12, []
     clock.learn_end(end_ns)
     for gap_ns in gaps_ns:
@@ -125,14 +126,18 @@ def missed_when_late(number: int, late_ns: int) -> int:
         (9, 2_000 * MS - PERIOD_NS + 1, 1),
     ],
 )
-def test_a_late_sweep_tells_how_many_were_missed(number: int, late_ns: int, missed: int) -> None:
+def test_sweeps_missed_before_a_late_one_are_counted(
+    number: int, late_ns: int, missed: int
+) -> None:
     assert missed_when_late(number, late_ns) == missed
 
 
 @pytest.mark.parametrize(
     ("doubt_ns", "untimed"), [(round(0.75 * PERIOD_NS) - 1, 0), (round(0.75 * PERIOD_NS), 1)]
 )
-def test_a_sample_vague_by_three_quarters_period_is_dropped(doubt_ns: int, untimed: int) -> None:
+def test_a_sample_uncertain_by_three_quarters_period_is_dropped(
+    doubt_ns: int, untimed: int
+) -> None:
     made, counters = assembler()
     for sample in concatenated([samples(n) for n in range(9)]):
         made.push(*sample)
@@ -208,7 +213,7 @@ def test_the_period_of_slow_and_fast_boards_is_learned(sequence: str, rate_hz: i
         (9, SLOT_NS, 3 * SLOT_NS, 1),
     ],
 )
-def test_a_skip_to_the_last_places_is_dropped_if_early(
+def test_a_sample_far_ahead_is_dropped_if_too_early(
     sweep: int, step_ns: int, t_ns: int, late: int
 ) -> None:
     sweeps, counters = assembler()
@@ -219,7 +224,7 @@ def test_a_skip_to_the_last_places_is_dropped_if_early(
     assert counters.late_frames == late
 
 
-def test_vague_times_teach_a_period_after_six_sweeps() -> None:
+def test_uncertain_times_teach_a_period_after_six_sweeps() -> None:
     sweeps, counters = assembler()
     for channel, words, t_ns in concatenated([samples(n) for n in range(20)]):
         sweeps.push(channel, words, t_ns - 3 * MS, t_ns)
@@ -227,7 +232,7 @@ def test_vague_times_teach_a_period_after_six_sweeps() -> None:
     assert (counters.untimed_frames, counters.readings) == (6 * 24, 14)
 
 
-def test_samples_of_vague_time_make_no_reading() -> None:
+def test_samples_of_too_uncertain_time_are_left_out() -> None:
     sweeps, counters = assembler()
     readings = feed(sweeps, concatenated([samples(n) for n in range(8)]) + samples(8)[:12])
     until_ns = samples(10)[12][2]

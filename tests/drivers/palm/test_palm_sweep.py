@@ -61,7 +61,7 @@ def test_fingers_come_in_the_order_asked_for(order: tuple[str, ...]) -> None:
                 assert (reading.faults[place] == MISSING).all()
 
 
-def test_a_value_that_is_not_fresh_is_held_or_missing() -> None:
+def test_an_electrode_without_its_valid_bit_is_held_or_missing() -> None:
     stream = packets(3)
     for index in (2, ROUND + 2):  # E2 and E3 of rounds 0 and 1, without the bit of other_sensor_1
         stream[index] = change(stream[index], "mf", {"valid": 0b0111})

@@ -123,7 +123,7 @@ def said(conversation: Conversation, now_ns: int) -> list[Message]:
 
 
 def hear(conversation: Conversation, message: Message, now_ns: int) -> list[TactileReading]:
-    """The readings that a message makes; a sweep comes when it is over, or at `now_ns` if later."""
+    """Let a message arrive at `now_ns`, a sweep not before its end; return the readings of it."""
     if isinstance(message, Sweep):
         now_ns = max(now_ns, T0 + 1000 * message.tick_end)
     return tactile(conversation.receive(encode(message), now_ns))
@@ -150,7 +150,8 @@ def told(conversation: Conversation, serials: tuple[str, ...], now_ns: int) -> N
 
 
 def greeted(about: Hello | None = None, sensors: Sequence[str] | None = None) -> Conversation:
-    """A conversation with a bridge that has answered with the HELLO `about`, before START."""
+    """A conversation, before START, whose bridge has answered with the HELLO `about`; None:
+    `hello(0)`."""
     conversation = opened(40, sensors)
     for _ in range(2):  # the serial numbers are believed when they are told again
         if conversation.hello is None and conversation.link.state is LinkState.GREETING:

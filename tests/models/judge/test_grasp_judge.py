@@ -24,7 +24,7 @@ def logit(probability: float) -> float:
 
 
 class Answers(FakeModel):
-    """Model that answers with the given probabilities."""
+    """Model that answers each grasp with the probabilities `p_stable` and `p_slip`."""
 
     def __init__(self, p_stable: float, p_slip: float) -> None:
         super().__init__()
@@ -39,7 +39,7 @@ def judge_of(model: FakeModel, threshold: float = 0.5) -> GraspJudge:
 
 
 def session(temperature: float) -> SessionCalibration:
-    """A session without grasps, with this divisor of the network's log-odds."""
+    """A session without grasps; `temperature`: its divisor of the network's log-odds."""
     softens = (Sharpness(0.0, temperature),)
     takes = SessionInput((0.0,) * 78, (1.0,) * 78, 5.0, 1.0, 20.0, softens)
     return SessionCalibration(takes, np.ones((3, 24)), np.ones((3, 24)))

@@ -65,11 +65,11 @@ class Reference:
         self.covariance += self.drift * (self.prior - self.covariance)
 
     def keep(self, told: list[int]) -> None:
-        """Keep the weights and the residual at these grasps, and of others only what they imply."""
+        """Keep the weights and the residual at the grasps `told`; derive all others from these."""
         self.go_on(told, *self.state(told))
 
     def go_on(self, told: list[int], mean: Exact, covariance: Exact) -> None:
-        """Continue from mean and covariance that another `Reference` returned for these grasps."""
+        """Continue from what `state(told)` of another `Reference` returned."""
         kept = [*self.weights, *(len(self.weights) + grasp for grasp in told)]
         links = self.prior[:, kept] @ inverse(self.prior[np.ix_(kept, kept)])
         left = self.prior - links @ self.prior[kept]
@@ -77,7 +77,8 @@ class Reference:
         self.covariance = links @ covariance @ links.T + left
 
     def state(self, told: list[int]) -> tuple[Exact, Exact]:
-        """Mean and covariance of the weights and of the residual at these grasps."""
+        """Mean and covariance of the weights, and of the residual at the grasps `told`, which are
+        numbers in the stream."""
         kept = [*self.weights, *(len(self.weights) + grasp for grasp in told)]
         return self.mean[kept], self.covariance[np.ix_(kept, kept)]
 

@@ -18,7 +18,11 @@ Outcome = tuple[float, NDArray[np.float32], bool]
 def lifts(
     number: int, inputs: int, seed: int = 0, strength: float = 0.6, spread: float = 1.0
 ) -> Iterator[Outcome]:
-    """Yield margin, inputs and outcome of lifts; a logistic model of margin and inputs is true."""
+    """Yield margin, inputs and outcome of lifts, drawn by a logistic model of margin and inputs.
+
+    `number`: of lifts. `inputs`: of each. `strength`: size of the model's weights. `spread`:
+    standard deviation of the inputs.
+    """
     random = np.random.default_rng(seed)
     weights = random.normal(0.0, strength / math.sqrt(inputs), inputs)
     for _ in range(number):

@@ -31,7 +31,7 @@ def test_the_prior_is_scikit_learns_kernel() -> None:
 
 
 @pytest.mark.parametrize(("kept", "spread"), [(128, 0.5), (7, 0.5), (7, 1e-6), (7, 100.0)])
-def test_the_learner_equals_a_dense_reference_that_knows_all_grasps(
+def test_the_learner_equals_a_dense_computation_over_all_grasps(
     kept: int, spread: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Grasps nearly equal make a kernel that is nearly singular."""

@@ -136,7 +136,7 @@ def test_networks_saw_neither_objects_nor_poses_of_their_streams(
     }
 
 
-def test_a_good_grasp_that_is_refused_counts_as_not_stable() -> None:
+def test_a_refused_grasp_that_would_hold_counts_as_not_stable() -> None:
     whole = stream()
     refused = np.arange(GRASPS) % 2 == 0
     life = live(changed(whole, refused=refused), RiskLimits(), every=True)

@@ -32,7 +32,7 @@ def test_digests_of_all_systems_are_unchanged() -> None:
     assert hashlib.sha256("".join(lines).encode()).hexdigest() == ALL_DIGESTS
 
 
-def test_each_zoo_model_was_made_of_its_system() -> None:
+def test_each_zoo_models_card_has_its_systems_configuration() -> None:
     fields = ("input", "estimator", "recipe", "augmentation", "tables")
     for name in zoo.names():
         assert zoo.card(name)["system"] == configuration(SYSTEMS[name], *fields)
