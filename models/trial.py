@@ -39,7 +39,9 @@ passed: deque[str] = deque(maxlen=8)
 
 
 def load(path: Path, file: ModelFile | None = None) -> TactileModel:
-    """Return the model at `path`, warm. Raises `ModelError`, also if it is too slow or large.
+    """Return the model at `path`, after a trial in a process of its own if it is not of the zoo.
+
+    Raises `ModelError`, also if the model is too slow or large.
 
     `file`: its content, if it was read before.
     """

@@ -64,7 +64,7 @@ def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def without(*arguments: object) -> tuple[int, str, str]:
-    """Run graspd without POSIX; return exit code, stdout without times, and stderr."""
+    """Run graspd with `arguments` without POSIX; return exit code, stdout without times, stderr."""
     done = subprocess.run(
         [*WITHOUT, *map(str, arguments)],
         capture_output=True,
@@ -76,7 +76,8 @@ def without(*arguments: object) -> tuple[int, str, str]:
 
 
 def said_of(*lines: str) -> list[tuple[int, str, str]]:
-    """Return exit code, stdout without times, and stderr of each command without POSIX."""
+    """Run each of `lines` of graspd without POSIX; return exit codes, stdout without times, and
+    stderr."""
     _, out, _ = without("-c", f"lines = {lines!r}\n{SAID_OF}")
     found: list[tuple[int, str, str]] = json.loads(out)
     return found

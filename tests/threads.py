@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def at_work(*tasks: Callable[[threading.Event], object]) -> Iterator[threading.Event]:
-    """Run each task in a thread, with an event that is set at the end of the block, and wait then.
+    """Run each of `tasks` in a thread, with an event that is set at the block's end; then wait.
 
     Yields the event.
     """

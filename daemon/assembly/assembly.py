@@ -77,7 +77,8 @@ def build_pipeline(
     *,
     learns: bool = True,
 ) -> Pipeline:
-    """Build the scene's judge; if it `learns`, judged grasps calibrate it. Raises `ModelError`."""
+    """Build the scene's judge. `clock`: monotonic ns. `learns`: True lets judged grasps calibrate
+    its session. Raises `ModelError`."""
     scene = plan.scene
     _refuse_other_fingers(scene, model)
     limits = Limits(
@@ -217,9 +218,10 @@ def _tactile(plan: Plan) -> Driver:
 def player(
     plan: Plan, options: ReplayTactile, speed: float | None, *, strict: bool = False
 ) -> ReplayDriver | BagDriver | McapReplayDriver:
-    """Make the driver that plays a scene's recordings; `speed` None: fast. Raises `ValueError`.
+    """Make the driver that plays a scene's recordings. Raises `ValueError`.
 
-    `strict`: a value in a table that is not a count ends the replay with an error.
+    `speed`: factor of real time; None: as fast as possible. `strict`: a value in a table that is
+    not a count ends the replay with an error.
     """
     fingers, kind = plan.scene.hand.fingers, recorded_kind(options)
     if kind in BAGS:

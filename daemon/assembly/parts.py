@@ -146,7 +146,10 @@ class Assembly:
 
 
 def build_recorder(parts: Parts, options: Record, boot_id: str, tap: Tap | None) -> Recorder:
-    """Start the recorder of `[record]`. Raises `SceneError` if the package `mcap` is missing."""
+    """Start the recorder of `[record]`. `tap`: gives the link's traffic; None: not recorded.
+
+    Raises `SceneError` if the package `mcap` is missing.
+    """
     require_mcap("[record]")
     from graspd.daemon.record.recorder import PATIENCE_S, Recorder, ReplayRecorder
 

@@ -56,7 +56,10 @@ class Source:
         return scene.parse({**self._sections, **changes}, self._where)
 
     def parts(self, replayed: Scene, model: TactileModel, speed: float | None) -> Parts:
-        """Make driver and judge; `speed` None: fast. Raises `SceneError` or `RecordingError`."""
+        """Make driver and judge. `speed`: factor of real time; None: as fast as possible.
+
+        Raises `SceneError` or `RecordingError`.
+        """
         raise NotImplementedError
 
     def restore(self, pipeline: Pipeline) -> None:
@@ -70,7 +73,7 @@ class Source:
         return []
 
     def end(self) -> None:
-        """Print how the replay differs from the run, if that is known."""
+        """Print how the verdicts differ from recorded ones, for recordings that have any."""
 
 
 class Tables(Source):
@@ -87,7 +90,11 @@ class Tables(Source):
         strict: bool = False,
     ) -> None:
         """`sections`: sections of the scene that replace the defaults for playing `paths`.
-        `read_as`, `rate_hz`, `loop`, `strict`: as of `ReplayDriver`; not for bags."""
+
+        Not for bags: `read_as`: what the rows are; None: find out. `rate_hz`: rows/s of files
+        without times; None: the usual ones. `loop`: start again after the last file. `strict`:
+        a value that is not a count raises.
+        """
         self._paths = [path.absolute() for path in paths]
         self._strict = strict
         tactile = {"driver": "replay", "recordings": self._paths, "loop": loop}

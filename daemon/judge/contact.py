@@ -307,7 +307,7 @@ class Contact:
         self.touches[finger] = Touch(self.touches[finger].threshold)
 
     def _settle(self, finger: int, rest: Rest, t_ns: int) -> None:
-        """Adopt a new tare; a known baseline changes at most at the speed limits."""
+        """Adopt `rest` as a finger's tare; a known baseline changes at most at the speed limits."""
         touch, former, baseline = self.touches[finger], self.baseline[finger], rest.baseline
         elapsed_s = 0.0 if touch.tared_ns is None else max(t_ns - touch.tared_ns, 0) / 1e9
         touch.tared_ns = t_ns

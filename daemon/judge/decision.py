@@ -105,9 +105,9 @@ def decide(
     """Return the decision, and the reasons if it is `unknown`. Any doubt makes it `unknown`.
 
     `p_slip`: probability of slip, 0..1; None: the network gave none. `objections`: reasons against
-    this reading, or against the earlier one that the network judged. `age_ns`: age of the
-    reading. `withheld`: why the risk forbids `stable`; None: it does not. `held`: result of
-    `HoldDown.at`.
+    this reading, or against the earlier one that the network judged. `moment`: state of the grasp.
+    `age_ns`: age of the reading. `withheld`: why the risk forbids `stable`; None: it does not.
+    `held`: an earlier judgement that still forbids `stable`, if any.
     """
     reasons = [*objections]
     if not (moment.in_contact and moment.settled):

@@ -334,7 +334,7 @@ class Gate:
         return (Reason.MOVING,) if limits.early else ()
 
     def _is_due(self, t_ns: int, fresh: bool) -> bool:
-        """Return True if this reading is the one to judge."""
+        """Return True if this reading is the one to judge; `fresh`: it has new values."""
         if self.phase.state is GateState.JUDGED:
             return self._question.is_due(t_ns, fresh)
         is_asked = self._still.early or self._question.is_asked

@@ -78,10 +78,11 @@ class Pipeline:
         needs_session: bool = False,
         trust: Trust | None = None,
     ) -> None:
-        """`clock` returns monotonic ns; without `hand` each reading is a grasp.
+        """`clock` returns monotonic ns. `hand` None: without a gate, so each reading is a grasp.
 
-        Unless it `learns`, the session stays what it is; with `needs_session` nothing is judged
-        before it is calibrated. Raises `ModelError` if the model is for other fingers.
+        `learns` False: the session takes in no grasps. `needs_session`: nothing is judged before
+        the session is calibrated. `trust`: what outcomes teach; None: nothing, and no risk.
+        Raises `ModelError` if the model is for other fingers.
         """
         if model.contract.fingers != tuple(fingers):
             raise ModelError(
@@ -311,8 +312,11 @@ class Pipeline:
         risk: RiskOutcomes | None,
         counts: NDArray[np.uint16] | None = None,
     ) -> Judgement:
-        """Return the judgement of a reading; `unusable` has the reasons against using it. A
-        judgement that is not `stable` is kept as `HoldDown` of later ones."""
+        """Return the judgement of a reading; `unusable` has the reasons against using it.
+
+        `worth`: assessment of the grasp; None: the network's opinion stands. A judgement that is
+        not `stable` is kept as `HoldDown` of later ones.
+        """
         calibrated = None if self.session is None else self.session.calibrated
         objections = unusable
         if opinion.refusal is not None:

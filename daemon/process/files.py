@@ -46,7 +46,7 @@ def read_regular(path: Path, max_bytes: int) -> bytes:
 
 
 def write_atomically(path: Path, content: bytes, mode: int = 0o600) -> None:
-    """Replace the file at `path` in one step.
+    """Replace the file at `path` in one step; `mode`: its permissions.
 
     Readers always see a whole file, also after a power cut. After an `OSError` the old file stays.
     """

@@ -36,7 +36,8 @@ def did_you_mean(wrong: str, words: Iterable[str]) -> str:
 
 
 def printable(text: str, length_max: int | None = None) -> str:
-    """Cut the text to `length_max`, then escape what is not printable."""
+    """Shorten the text to `length_max` characters (None: no limit), then escape what is not
+    printable."""
     if length_max is not None and len(text) > length_max:
         text = text[: length_max - 3] + "..."
     if text.isprintable():

@@ -166,7 +166,8 @@ class Courier(Proxy):
             self._front.send_multipart(unpacked(self._back.recv()), zmq.NOBLOCK)
 
     def _carry_question(self) -> bool:
-        """Carry one question, cut to `FRAMES_MAX` frames; False: none waits, or no room for it."""
+        """Carry one question, its first `FRAMES_MAX` frames; return False if none waits or the
+        queue is full."""
         if not self._back.poll(0, zmq.POLLOUT) or not self._front.poll(0):
             return False
         first = self._front.recv(copy=False)

@@ -114,7 +114,7 @@ class Sockets(Companion):
             self.questions = Questions(self._answer, round(wanted.gate.request_ms * 1e6), tells)
 
     def _tells(self, wanted: Scene) -> Callable[[bytes], bool]:
-        """Return a function: True if the scene lets a credential lift and report outcomes."""
+        """Return a function that is True for credentials that may lift and report outcomes."""
         names = () if wanted.ask is None else wanted.ask.tell or ()
         if (wanted.ask_endpoint or "").startswith("ipc://"):
             return {b"user %d" % user_id(name) for name in names}.__contains__

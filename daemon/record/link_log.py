@@ -35,13 +35,13 @@ class Tap:
         self._sink: Sink | None = None
 
     def connect(self, sink: Sink) -> None:
-        """Pass the held entries to `sink`, and later ones at once."""
+        """Pass the entries that were kept until now to `sink`, and later ones at once."""
         while self._early:
             sink(*self._early.popleft())
         self._sink = sink
 
     def take(self, *entry: object) -> None:
-        """Add CAN frames, or an event and the bytes of a serial line."""
+        """Add an `entry`: CAN frames, or an event and the bytes of a serial line."""
         at_ns = time.monotonic_ns()
         if self._sink is None:
             self._early.append((entry, at_ns))

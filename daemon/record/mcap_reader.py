@@ -162,7 +162,7 @@ class McapReader:
 
     @property
     def cut_off(self) -> bool:
-        """True if the part read so far ends in a cut or damage."""
+        """True if the part read so far ends where the file is truncated or damaged."""
         return self._damage is not None
 
     def __iter__(self) -> Iterator[RecordedMessage]:

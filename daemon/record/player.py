@@ -174,7 +174,7 @@ def _in_order(recording: McapReader) -> Iterator[RecordedMessage]:
 
 
 def _called_late(held: Sequence[RecordedMessage]) -> Iterator[RecordedMessage]:
-    """Yield the held reading and messages with a `late` mark before them."""
+    """Yield a `late` mark, then `held`: a reading and messages about it; nothing if it is empty."""
     if held:
         yield held[0]._replace(kind=Topic.LATE, payload=LATE)
     yield from held

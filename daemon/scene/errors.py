@@ -57,7 +57,8 @@ def _line(path: Path, scene: Section, mistake: ErrorDetails) -> str:
 
 
 def _shown(value: object) -> str:
-    """Return a value as Python writes it, cut. `repr` fails for long numbers and deep lists."""
+    """Return a value as Python writes it, at most `SHOWN_MAX` characters. `repr` fails for long
+    numbers and deep lists."""
     try:
         return printable(repr(value), SHOWN_MAX)
     except (ValueError, RecursionError):

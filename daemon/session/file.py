@@ -93,12 +93,14 @@ def write(path: Path, kept: KeptSession) -> None:
 
 
 def restore(path: Path, fingers: Sequence[str], session: SessionCalibration) -> None:
-    """Let `session` continue from the file. Raises `SessionFileError` if that is not possible."""
+    """Let `session` continue from the file. Raises `SessionFileError` if the file cannot be read,
+    or is of other fingers or another model."""
     restore_kept(load(path), fingers, session)
 
 
 def restore_kept(kept: KeptSession, fingers: Sequence[str], session: SessionCalibration) -> None:
-    """Let `session` continue from a kept one. Raises `SessionFileError` if it cannot."""
+    """Let `session` continue from a kept one. Raises `SessionFileError` if that is of other
+    fingers or another model."""
     of_fingers(kept, fingers)
     if kept.statistics is None:
         raise SessionFileError("the kept session is of a model that needs no statistics")

@@ -304,7 +304,7 @@ class View:
         return lines
 
     def _resting(self) -> Sequence[str]:
-        """Return the tared fingers, while the gate says that nothing touches."""
+        """Return the tared fingers while the gate says that nothing touches, else none."""
         if self._status is None or self._gate is not GateState.IDLE:
             return ()
         return self._status.tared or ()

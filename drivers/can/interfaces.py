@@ -77,7 +77,8 @@ logging.getLogger("can").setLevel(logging.CRITICAL)
 
 
 def refuse_unusable(interface: str, channel: str, bitrate: int | None, options: Options) -> None:
-    """Raise `ValueError` if such a bus can never be opened on this computer. Opens nothing."""
+    """Raise `ValueError` if a bus with these arguments can never be opened on this computer; open
+    nothing. `bitrate`: bit/s; None: not set."""
     if interface not in can.VALID_INTERFACES:
         raise ValueError(f"interface: {_what_there_is(interface)}")
     if interface in _WINDOWS:
@@ -120,8 +121,10 @@ def open_bus(interface: str, channel: str, **options: Any) -> can.BusABC:  # noq
 
 
 def _open_socketcand(channel: str, host: str, port: int, **options: Any) -> can.BusABC:  # noqa: ANN401
-    """Connect, with `CONNECT_S` at most for each step. python-can alone would wait for ever, or
-    spin for ten seconds."""
+    """Connect, with `CONNECT_S` at most for each step; `options`: further ones of the bus.
+
+    python-can alone would wait for ever, or spin for ten seconds.
+    """
     before_s = socket.getdefaulttimeout()
     socket.create_connection((host, port), CONNECT_S).close()
     socket.setdefaulttimeout(CONNECT_S)

@@ -53,8 +53,9 @@ class Fate(Enum):
 def classify(place: int, last: int, timing: Timing, held: Held, *, is_over: bool) -> Fate:
     """Return the fate of a sample, by the table in `deploy/can/PROTOCOL.md`.
 
-    `last`: furthest place, 0 to 23, of the current sweep, -1 for none. `is_over`: True if the
-    reading of the current sweep was handed over.
+    `place`: the sample's, 0 to 23. `last`: furthest place of the current sweep, -1 for none.
+    `held`: words that the place already has. `is_over`: True if the reading of the current sweep
+    was handed over.
     """
     if timing is Timing.LATE or last - place > REORDER_MAX:
         return Fate.BEGINS

@@ -119,7 +119,11 @@ class SweepClock:
         self.t_ns = t_ns
 
     def next_end_ns(self, last: int, *, is_over: bool) -> int | None:
-        """Return when the next reading should be complete; None: not known yet."""
+        """Return when the next reading should be complete; None: not known yet.
+
+        `last`: furthest place of the current sweep, -1 for none. `is_over`: True if its reading was
+        handed over.
+        """
         if self.period_ns is None or last < 0:
             return None
         left = 1.0 if is_over else self._position[-1] - self._position[last]

@@ -156,7 +156,9 @@ class TactileStreamDriver(DatagramDriver[TactileStream]):
         only_from: str | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """`hand`: its name; messages that name another one are dropped."""
+        """`source`: `udp://ADDRESS:PORT` to receive on. `fingers`: the rows of a reading. `hand`:
+        its name; messages that name another one are dropped. `only_from`: IP address whose
+        datagrams are taken; None: any."""
         self._fingers = tuple(fingers)
         self._hand = hand
         super().__init__(source, only_from=only_from, clock=clock)

@@ -181,7 +181,7 @@ class PalmStream:
         return (*finished, self._finish()) if self._have == _COMPLETE else finished
 
     def _is_duplicate(self, packet: PalmPacket, position: int, t_ns: int) -> bool:
-        """Return True for a copy of a packet of this round, False for its like in the next one."""
+        """Return True for a copy of a packet of this round, False for an equal one of the next."""
         if self.packets[position] != packet or self._place is None or self._place_t_ns is None:
             return False
         elapsed_ns = t_ns - self._place_t_ns

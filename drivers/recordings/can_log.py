@@ -186,7 +186,8 @@ class CanLog(LinkLogDriver[CanFrame]):
         super().open()
 
     def _choose(self, buses: set[str]) -> str:
-        """Return the bus to play. Raises `RecordingError` if that is not clear."""
+        """Return the bus to play. Raises `RecordingError` if no frame was found, or if there are
+        several buses and the chosen channel is not one of them."""
         names = ", ".join(sorted(buses)[:SHOWN_MAX])
         if not buses:
             raise RecordingError(self.paths[0], "has no frame")

@@ -258,7 +258,10 @@ class _Rows:
 def time_value(
     column: TimeColumn, cells: Sequence[str], *, decimal_comma: bool = False
 ) -> float | None:
-    """Return the time of a row in the unit of the column; None if it has none."""
+    """Return the time of a row in the unit of the column; None if the row has no time.
+
+    `decimal_comma`: True if a comma stands for the point.
+    """
     value = time_of(cells[column.places[0]], decimal_comma=decimal_comma)
     if len(column.places) == 1 or value is None:
         return value

@@ -37,7 +37,7 @@ class Residual:
     """
 
     def __init__(self, grasps: Matrix) -> None:
-        """`grasps`: inputs of the told grasps, shape (N, inputs)."""
+        """`grasps`: inputs of the grasps with a known outcome, shape (N, inputs)."""
         inputs = grasps.shape[1]
         self.variance = SHARED_VARIANCE + OWN_VARIANCE if inputs else 0.0
         """Prior variance of the residual at any grasp; 0 without inputs, where none exists."""
@@ -49,9 +49,9 @@ class Residual:
             self.add(each)
 
     def add(self, inputs: Vector) -> None:
-        """Append a told grasp. Its residual is first predicted by the others alone.
+        """Append a grasp with a known outcome. Its residual is first predicted by the others alone.
 
-        In a state its mean and spread are therefore zeros.
+        In a state the grasp's mean and spread are therefore zeros.
         """
         # Not a matrix product, whose rounding depends on the other rows.
         squares = np.square(self.grasps - inputs).sum(axis=1, keepdims=True)
@@ -74,8 +74,8 @@ class Residual:
         return np.delete(mean, oldest) + mean[oldest] * along, spread
 
     def limited(self, mean: Vector, limit: float) -> Vector:
-        """Return a state's mean, changed in place so that all weights and told residuals are within
-        +-`limit`."""
+        """Return a state's mean, changed in place: all weights, and the residuals of told grasps,
+        are within +-`limit`."""
         weights = len(mean) - len(self.grasps)
         values = self.prior @ mean[weights:]
         if (np.abs(values) > limit).any():
@@ -84,7 +84,8 @@ class Residual:
         return mean
 
     def at_told(self, mean: Vector, spread: Matrix) -> tuple[Vector, Matrix]:
-        """Return mean and covariance of a state's weights and of its residual at told grasps."""
+        """Return mean and covariance of a state's weights, and of its residual at the grasps with a
+        known outcome. `mean`, `spread`: the state."""
         links = self._links(len(mean))
         covariance = links @ spread @ links
         weights = len(mean) - len(self.grasps)
@@ -92,7 +93,7 @@ class Residual:
         return links @ mean, (covariance + covariance.T) / 2.0
 
     def from_others(self, mean: Vector, covariance: Matrix) -> tuple[Vector, Matrix]:
-        """Return mean and spread of the state for which `at_told` returns these."""
+        """Return mean and spread of the state whose `at_told` is `mean` and `covariance`."""
         back, covariance = np.linalg.inv(self._links(len(mean))), covariance.copy()
         weights = len(mean) - len(self.grasps)
         covariance[weights:, weights:] -= self.prior
@@ -109,7 +110,8 @@ class Residual:
         return links
 
     def shared(self, inputs: Vector) -> Vector:
-        """Return the covariances (N,) of the residual at another grasp with that at told grasps."""
+        """Return the covariances (N,) of the residual at another grasp, of these `inputs`, with
+        that at each grasp with a known outcome."""
         return self._shared(self._squares + inputs @ inputs - 2.0 * (self.grasps @ inputs))
 
     def _shared(self, squares: NDArray[np.float64]) -> NDArray[np.float64]:

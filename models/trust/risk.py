@@ -58,7 +58,7 @@ class RiskLimits:
 
 
 class RiskState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """State of `Risk`; see its attributes."""
+    """State of a `Risk`: its attributes of these names, and the share of its limits."""
 
     max_slip_when_stable: float | None
     lifts: Count
@@ -159,7 +159,11 @@ class Risk:
         return min(math.log(odds), 0.0)
 
     def figures(self, outstanding: int, announced: int, awaited: int) -> RiskOutcomes:
-        """Return the outcomes until now, with the lift book's numbers of lifts that have none."""
+        """Return the outcomes until now, with numbers of the lift book.
+
+        `outstanding`: `stable` lifts without an outcome. `announced`: lifts that were announced.
+        `awaited`: those of them without an outcome.
+        """
         return RiskOutcomes(
             target=self.limits.max_slip_when_stable,
             lifts=self.lifts,

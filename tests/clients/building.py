@@ -126,12 +126,12 @@ class Probe:
         self._process = process
 
     def tell(self, *words: object) -> None:
-        """Give the probe an order, which it reads after the next `flush`."""
+        """Give the probe the order `words`, which it reads after the next `flush`."""
         assert self._process.stdin is not None
         self._process.stdin.write(" ".join(map(str, words)) + "\n")
 
     def ask(self, *words: object) -> str:
-        """Give the probe an order; return the first line of its answer."""
+        """Give the probe the order `words`; return the first line of its answer."""
         self.tell(*words)
         self.flush()
         return self.line()

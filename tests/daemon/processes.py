@@ -39,7 +39,7 @@ with zmq.Context() as context, context.socket(zmq.SUB) as socket:
 
 
 def graspd(*arguments: object, timeout_s: float = TIMEOUT_S) -> subprocess.CompletedProcess[str]:
-    """Run a command of graspd to its end."""
+    """Run graspd with `arguments` to its end."""
     return subprocess.run(
         [*GRASPD, *map(str, arguments)],
         capture_output=True,
@@ -66,9 +66,9 @@ def graspd_with(module: str, **constants: object) -> tuple[str, ...]:
 def start(
     *arguments: object, before: Sequence[str] = (), program: Sequence[str] = GRASPD
 ) -> Started:
-    """Start a command of graspd, or `program`, after the words `before`; leave it running.
+    """Start graspd, or `program`, with `arguments`, after the words `before`; leave it running.
 
-    Without `before` its priority is raised if that is permitted: other tests may run meanwhile.
+    Without `before` its priority is raised if the system permits: other tests may run meanwhile.
     """
     process = Started(
         [*before, *program, *map(str, arguments)],
@@ -82,14 +82,14 @@ def start(
 
 
 def put_first(pid: int) -> None:
-    """Raise the priority of a process if that is permitted."""
+    """Raise the priority of a process if the system permits."""
     with contextlib.suppress(PermissionError):
         os.setpriority(os.PRIO_PROCESS, pid, NICENESS)
 
 
 @contextlib.contextmanager
 def before_others() -> Iterator[None]:
-    """Raise the priority of this thread, and of what it starts meanwhile, if that is permitted."""
+    """Raise the priority of this thread, and of what it starts, if the system permits."""
     former = os.getpriority(os.PRIO_PROCESS, 0)
     put_first(0)
     try:

@@ -89,7 +89,8 @@ class Board:
         self._process.wait(10)
 
     def do(self, name: str, /, **arguments: object) -> dict[str, Any]:
-        """Send a command to `emulator/main.cjs`; return its answer, and move `now_ns` on."""
+        """Send the command `name` with `arguments` to `emulator/main.cjs`; return its answer, and
+        move `now_ns` on."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.write(json.dumps({"do": name, **arguments}) + "\n")

@@ -79,7 +79,10 @@ class JsonLines:
         self._socket.close()
 
     def request(self, execute: str, timeout_s: float, **arguments: object) -> Any:  # noqa: ANN401
-        """Send a request, and return the value of the answer. Raises `ProtocolError`."""
+        """Send the request `execute` with `arguments`; return the value of the answer.
+
+        Raises `ProtocolError` if it is refused, late or cannot be sent.
+        """
         message = {"execute": execute, "arguments": arguments}
         try:
             self._socket.sendall(json.dumps(message).encode() + b"\n")

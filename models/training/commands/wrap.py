@@ -177,7 +177,10 @@ def _answers(
     shape: list[int],
     session: Any,  # noqa: ANN401
 ) -> NDArray[np.float32]:
-    """Return the answers of the network, one grasp at a time."""
+    """Return a network's answers to counts, run one grasp at a time in an onnxruntime `session`.
+
+    `name`, `shape`: of its input, for one grasp. `answer`: name of its output.
+    """
     one = (each.reshape(1, *shape).astype(np.float32) for each in counts)
     return np.concatenate([session.run([answer], {name: each})[0] for each in one])
 

@@ -163,7 +163,7 @@ def vector_model(
 
 
 def nodes_of(*texts: str) -> list[onnx.NodeProto]:
-    """Return a node for each text, such as `y = Mul (x, factor)`."""
+    """Return a node for each of `texts`, such as `y = Mul (x, factor)`."""
     nodes = [parse_node(text) for text in texts]
     for node in nodes:
         node.ClearField("domain")  # the parser writes "", the default

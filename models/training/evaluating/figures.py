@@ -67,7 +67,7 @@ class Figures:
 
     @property
     def variants(self) -> list[str]:
-        """Ways of judging, in the order in which they were tried."""
+        """Variants of session calibration in the rows, in the order in which they were judged."""
         return list(self.rows["variant"].unique())
 
     @property
@@ -116,7 +116,7 @@ class Figures:
         return metrics.over_seeds(self.folds_of(figure, variant).to_numpy())
 
     def f1_interval(self) -> tuple[float, float]:
-        """Return the 95 % interval of F1 over all grasps, as if other such objects were drawn."""
+        """Return the 95 % interval of F1 over all grasps, by drawing objects with replacement."""
         rows = self.of_variant()
         slip, slipped = rows["margin"] > 0.0, rows["slipped"]
         of = slip.astype(int) + slipped

@@ -41,7 +41,8 @@ def results_table(
 ) -> str:
     """Return the whole document as Markdown; what was not run is `-`.
 
-    `grasps`: judged grasps. `command`, `made_with`: command line, and versions by library.
+    `several`: one for each system and protocol. `grasps`: judged grasps. `command`, `made_with`:
+    command line, and versions by library. `quick`: the page says that the run was a quick one.
     """
     by_group: ByGroup = {(one.system, one.protocol): one for one in several}
     sections = (

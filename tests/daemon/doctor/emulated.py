@@ -178,7 +178,7 @@ def scene_of(folder: Path, text: str) -> Path:
 
 
 def asked(folder: Path, text: str, *options: str) -> CompletedProcess[str]:
-    """Run `graspd doctor` for 0.6 s on a scene of `text`."""
+    """Run `graspd doctor`, with `options`, for 0.6 s on a scene of `text`."""
     return graspd("doctor", scene_of(folder, text), "--listen", 0.6, *options)
 
 

@@ -73,7 +73,7 @@ class Asked:
         return True
 
     def tell(self, peer: bytes, *frames: bytes, requests: Requests | None = None) -> dict[str, Any]:
-        """Report an outcome, which is not counted as a question; return the answer."""
+        """Report an outcome by `frames`, which is not counted as a question; return the answer."""
         requests = requests or Requests(takes_the_seventh)
         self.questions.take([[peer, USER, *frames]], 0, requests)
         assert requests.times == 0

@@ -185,7 +185,7 @@ def sweeps() -> list[TactileReading]:
 
 
 def again(*paths: Path) -> list[Judgement]:
-    """Return the judgements of a replay, with the recorded times of the readings."""
+    """Return the judgements of a replay of `paths`, with the recorded times of the readings."""
     run = RecordedRun(paths)
     wanted = run.scene({}, {}, None)
     parts = run.parts(wanted, assembly.load_model(wanted), None)

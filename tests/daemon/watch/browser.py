@@ -152,7 +152,7 @@ class Browser:
         self._ask("Target.disposeBrowserContext", browserContextId=context)
 
     def ask(self, method: str, **parameters: object) -> Answer:
-        """Send a DevTools command to the page, and return its answer."""
+        """Send the DevTools command `method` with `parameters` to the page; return its answer."""
         return self._ask(method, self._session, **parameters)
 
     def look(self, width: int, height: int, theme: Literal["light", "dark"] = "light") -> None:

@@ -26,7 +26,7 @@ FINGERS = ("ff", "mf", "th")
 
 
 def message(counts: object = None, **fields: object) -> bytes:
-    """A datagram with number 1 and counts of three fingers, unless the arguments differ."""
+    """A datagram with number 1 and counts of three fingers, unless `counts` or `fields` differ."""
     whole = {"seq": 1, "counts": dict.fromkeys(FINGERS, COUNTS) if counts is None else counts}
     return json.dumps({**whole, **fields}).encode()
 

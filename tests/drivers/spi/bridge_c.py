@@ -38,7 +38,10 @@ Counts = NDArray[np.uint16]
 
 
 def build_program(folder: Path, name: str, *sources: str) -> Path:
-    """Compile a program of files under `deploy/bridge`, with sanitizers; warnings are errors."""
+    """Compile the program `name` of `sources`, files under `deploy/bridge`, with sanitizers.
+
+    Warnings are errors.
+    """
     program = folder / name
     files = [str(file) for source in sources for file in sorted(BRIDGE.glob(source))]
     includes = [f"-I{BRIDGE}/src", f"-I{BRIDGE}/host"]

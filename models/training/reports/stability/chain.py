@@ -257,7 +257,8 @@ def _relative(inputs: NDArray[np.float32], exact: Exact) -> NDArray[np.float64]:
 
 
 def _flips(p_slip: NDArray[np.float64], right: NDArray[np.float64]) -> int:
-    """Count verdicts that differ from the reference, if it is over the bound off the threshold."""
+    """Count verdicts that differ from those of the reference's `right`; leave out those where
+    `right` is within `P_SLIP_ERROR_MAX` of the threshold."""
     other = (p_slip >= THRESHOLD) != (right >= THRESHOLD)
     return int((other & (np.abs(right - THRESHOLD) > P_SLIP_ERROR_MAX)).sum())
 

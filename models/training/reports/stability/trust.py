@@ -188,7 +188,8 @@ def budget_row() -> Row:
 
 
 def statistics_row(case: str, spike: float | None) -> Row:
-    """Compare the statistics of a long session with their closed form."""
+    """Compare the statistics of a long session with their closed form. `spike`: one extreme value
+    among the others; None: without."""
     random = np.random.default_rng(0)
     values = random.integers(0, 4096, (UPDATES, WIDTH)).astype(np.float64)
     values[:, STILL] = 2000.0
