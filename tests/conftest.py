@@ -53,8 +53,8 @@ BEGUN_FIRST = (
     "test_readme.py",
     "test_without_posix.py",
 )
-"""Test files that take longest, which are begun first: each runs in one process, so that a long one
-begun last would run alone."""
+"""Test files that take longest. They are begun first: as all tests of a file run in one process, a
+long file that is begun last would run alone."""
 
 
 def data_dir() -> Path | None:

@@ -183,7 +183,7 @@ def test_commands_are_sent_to_all_and_answers_read_from_each(run: Run) -> None:
         assert {one.mosi for one in sweep if not one.is_command} == {b"\x01\x00"}
 
 
-def test_a_sweep_takes_its_bits_and_waits_and_little_more(run: Run) -> None:
+def test_a_sweep_takes_little_longer_than_its_bits_and_waits(run: Run) -> None:
     sensors, slots = run.setting.sensors, len(COMMANDS[run.setting.sequence])
     bits_us = 16e6 * (1 + sensors) / run.timing.spi_hz
     least_us = slots * (bits_us + SETTLE_US + GAP_US * sensors)

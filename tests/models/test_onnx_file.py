@@ -96,7 +96,7 @@ def is_sound(model: Any) -> bool:  # noqa: ANN401
     )
 
 
-def test_zoo_and_a_small_model_may_be_used() -> None:
+def test_models_of_the_zoo_and_a_small_one_are_accepted() -> None:
     for name in zoo.names():
         onnx_file.check(zoo.find(name).read_bytes())
     onnx_file.check(small().SerializeToString())

@@ -57,7 +57,7 @@ class Case:
     tells: bool = False
     """True if the controller lifts each judged grasp, and reports how that ended."""
     slow: bool = False
-    """True if judging is slower than the sensors at times, so that readings are skipped."""
+    """True if judging is slower than the sensors at times; then readings are skipped."""
 
 
 def run(case: Case, record_in: Path | None = None) -> list[Message]:

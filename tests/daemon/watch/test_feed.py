@@ -114,7 +114,7 @@ def hears(door: KeyedDoor, feed: Feed, until: Callable[[bool], bool]) -> bool:
         (None, "", "the daemon wants a key"),
     ],
 )
-def test_a_peer_that_is_turned_away_sees_why(
+def test_a_refused_viewers_link_says_the_likely_cause(
     tmp_path: Path, door: KeyedDoor, own: str | None, server: str, said: str
 ) -> None:
     keys = None if own is None else keys_of(tmp_path, own, server)

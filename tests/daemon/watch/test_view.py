@@ -161,7 +161,7 @@ def test_no_slip_probability_is_shown_as_0_or_100_percent(p_slip: float, words: 
     assert likely(p_slip) == words
 
 
-def test_a_verdict_without_a_calibrated_session_is_less_sure() -> None:
+def test_without_a_calibrated_session_a_stable_is_less_sure() -> None:
     why = seen_after(Decision.STABLE, session_calibrated=False).why
     assert [line.what for line in why] == ["lift", "less sure"]
 
