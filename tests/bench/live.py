@@ -126,7 +126,8 @@ def running(
 
     The scene has `sections`, and a last one `[publish]` with the lines of `publish`. The `endpoint`
     is `v` in `folder` unless given. `high_water_mark`: most messages that wait for a subscriber;
-    None: the daemon's own limit. `keys`: folder with the daemon's and the subscriber's keys.
+    None: the daemon's own limit. `topics`: beginnings of those that the subscriber gets. `keys`:
+    folder with the daemon's and the subscriber's keys; None: without.
     """
     endpoint = endpoint or f"ipc://{folder}/v"
     scene = folder / "scene.toml"

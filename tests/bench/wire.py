@@ -154,7 +154,11 @@ def listen(endpoints: Sequence[str], seconds: float) -> Mapping[str, Heard]:
 
 
 def times_of(way: Way, heard: Heard, written: Written) -> Iterator[int]:
-    """Yield the time of each sweep of a hand from its line to its first message, ns."""
+    """Yield the time of each sweep of a hand from its line to its first message, ns.
+
+    `heard`: messages of the hand, made by a daemon or an echo, as `way` says. `written`: when its
+    twin wrote the sweeps.
+    """
     ticks, ends_ns, written_ns = written.T
     parser, known = FrameParser(DIGEST), set[int]()
     for received_ns, payload in heard:

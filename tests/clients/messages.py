@@ -42,7 +42,8 @@ def verdict(
     silence_ms: float = 100.0,
     **more: Any,  # noqa: ANN401
 ) -> dict[str, Any]:
-    """Return a verdict message of a daemon that lacks `ADDED`, with `more` fields."""
+    """Return a verdict message on a reading at `read_ns`, of a daemon that lacks `ADDED`, with
+    `more` fields."""
     known = outcome != "unknown"
     return {
         "v": 1,

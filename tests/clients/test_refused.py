@@ -66,7 +66,10 @@ Grasps = Sequence[tuple[str, int]]
 
 
 def told(cpp: Probe | None, messages: list[list[bytes]], ended: Grasps = ()) -> Verdict:
-    """Return the verdict after these messages; outcomes of the grasps `ended` were told before."""
+    """Return the verdict after `messages`; outcomes of the grasps `ended` were reported before.
+
+    `cpp`: runs the C++ client too; None: only Python's.
+    """
     rules = Rules(cpp)
     for grasp in ended:
         rules.end(*grasp)

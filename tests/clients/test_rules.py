@@ -66,7 +66,7 @@ def test_both_clients_judge_random_messages_alike(
 
 
 def said(cpp: Probe | None, message: dict[str, Any]) -> Verdict:
-    """Return the verdict right after this message, the only one."""
+    """Return the verdict right after `message`, the only one. `cpp` None: only Python's rules."""
     rules = Rules(cpp)
     rules.take(frames(message))
     return rules.at()

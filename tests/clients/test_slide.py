@@ -121,7 +121,7 @@ def test_in_cpp_a_lift_is_stopped_for_the_same_reasons(
     ):
 
         def become(felt: Words) -> None:
-            """Change the fingers' states, and wait until a message has them."""
+            """Change the fingers' states to `felt`, and wait until a message has them."""
             fingers.update(felt)
             wait_until(lambda: other.verdict(0.1).fingers == fingers)
 

@@ -95,7 +95,8 @@ class World:
 
 @contextmanager
 def client(world: World, ask: bool = False, same: bool | None = None) -> Iterator[Client]:
-    """Make a client on the world's sockets and clocks. `same`: as `same_computer`."""
+    """Make a client on the world's sockets and clocks; `ask`: one that asks the daemon. `same`: as
+    `same_computer`."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(graspd_client, "_Link", lambda *_: world)
         clocks = {"monotonic_ns": world.monotonic_ns, "clock_gettime_ns": world.boot_ns}

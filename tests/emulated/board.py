@@ -112,7 +112,7 @@ class Board:
         return self
 
     def cut(self, what: str) -> None:
-        """Do `close`, `detach` or `stick`, after which one frame may be torn."""
+        """Do the command `what`: `close`, `detach` or `stick`; one frame may be torn after it."""
         self._torn = True
         self.do(what)
 

@@ -52,7 +52,7 @@ ASK = ours("daemon.publish.questions")
 
 
 def buses_but(own: str) -> set[str]:
-    """Modules that only other drivers need."""
+    """Modules that only drivers other than `own` need."""
     return set().union(*(modules for name, modules in BUSES.items() if name != own))
 
 

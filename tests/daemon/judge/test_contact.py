@@ -298,7 +298,10 @@ class Hand:
 
 
 def felt(depth: float, begin_s: float, end_s: float, drift: float = 0.0) -> Counts:
-    """Return sweeps of noisy sensors that drift from 0 s on, counts/s, pressed by `depth`."""
+    """Return sweeps at 100 Hz, `begin_s` to `end_s`, of noisy sensors pressed by `depth`, counts.
+
+    `drift`: that of all electrodes since 0 s, counts/s, besides their own.
+    """
     random, t_s = np.random.default_rng(1), np.arange(begin_s, end_s, 0.01)[:, None, None]
     mean = random.uniform(2400.0, 3400.0, (3, 24)) - depth * PRESSED + (drift + SLOPES) * t_s
     return np.rint(mean + random.normal(0.0, NOISE, mean.shape)).astype(np.uint16)

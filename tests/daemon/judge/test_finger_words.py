@@ -59,7 +59,7 @@ def felt(
 
 
 def words(told: Told, finger: Finger) -> list[str]:
-    """Return the states of a finger in order, each as often as it begins."""
+    """Return the states of a finger in `told`, in order, each as often as it begins."""
     said = [feelings[finger] or "unknown" for _, _, feelings in told]
     return [said[0], *(word for former, word in pairwise(said) if word != former)]
 

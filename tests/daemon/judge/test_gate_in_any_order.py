@@ -200,7 +200,8 @@ class Readings(RuleBasedStateMachine):
 
     @rule(pressed=st.sampled_from((40, 41, -40)), is_broken=st.booleans(), is_held=st.booleans())
     def press(self, pressed: int, is_broken: bool, is_held: bool) -> None:
-        """Press one finger harder; over 40 counts since the first judgement are another grasp."""
+        """Press one finger harder by `pressed` counts; over 40 since the first judgement make
+        another grasp. `is_broken`: half of its electrodes break. `is_held`: grasp first."""
         if is_held:
             self.grasp()
         self.pressed += pressed

@@ -30,7 +30,10 @@ def send(motion: JointMotion, t_ns: int, *angles: float, names: tuple[str, ...] 
 
 
 def turning(rate_hz: float, rad_per_s: float, seconds: float = 1.0) -> tuple[JointMotion, int]:
-    """Turn one joint of three at a constant speed; return also the time of the last angles, ns."""
+    """Turn one joint of three at `rad_per_s`, for `seconds`, with angles at `rate_hz`.
+
+    Return its motion, and the time of the last angles, ns.
+    """
     motion, t_ns = JointMotion(), START_NS
     for place in range(round(seconds * rate_hz) + 1):
         t_ns = START_NS + round(place / rate_hz * 1e9)
@@ -176,7 +179,8 @@ def test_up_to_64_lost_joints_are_remembered_once_each() -> None:
 def frozen(
     motion: JointMotion, begin_ms: int, end_ms: int, period_ms: float = 10.0
 ) -> Reason | None:
-    """Send angles that stay the same to the bit; return the objection at the last."""
+    """Send angles that stay the same to the bit, from `begin_ms` to `end_ms`, one a `period_ms`;
+    return the objection at the last."""
     found = None
     for ms in np.arange(begin_ms, end_ms + 0.5, period_ms).tolist():
         t_ns = START_NS + round(ms * MS)

@@ -137,7 +137,7 @@ def trusting(
 
 
 def lift(judge: Pipeline, clock: Clock, seed: int, *, slipped: bool) -> Judgement:
-    """Judge a grasp, report its outcome, and return the judgement."""
+    """Judge the grasp that `seed` draws, report its outcome, and return the judgement."""
     judgement = judge.judge(reading(clock(), seed))
     judge.outcome(GraspId(BOOT, judgement.moment.grasp), slipped=slipped)
     return judgement

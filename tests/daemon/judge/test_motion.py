@@ -23,7 +23,8 @@ def wavering(seconds: float, rate_hz: float, sigma: float, seed: int) -> NDArray
 
 
 def fed(motion: Motion, counts: NDArray[np.float64], rate_hz: float, begin_ns: int = 0) -> int:
-    """Feed sweeps, shape (sweeps, fingers, 24); return when the next one is due, ns."""
+    """Feed sweeps `counts`, shape (sweeps, fingers, 24), at `rate_hz` from `begin_ns` on to
+    `motion`; return when the next one is due, ns."""
     usable = np.ones(counts.shape[1:], dtype=np.bool_)
     for index, sweep in enumerate(np.rint(counts).astype(np.uint16)):
         motion.add(begin_ns + round(index / rate_hz * 1e9), sweep, usable)

@@ -53,7 +53,8 @@ def published(
 ) -> PublishedVerdict:
     """Return the golden verdict `name` with `changes`, as if published with `payload`.
 
-    `lifts`: the book of lifts that has the `grasp`; None: an empty one.
+    `lifts`: the book of lifts that has the `grasp`; None: an empty one. `keep`: calls its argument
+    once outcomes are on the disk.
     """
     verdict = replace(decode_verdict((GOLDEN / f"verdict_{name}.json").read_bytes()), **changes)
     judgement = Judgement(0, verdict.verdict, (), 0.1, Moment(grasp), Opinion(0.1))
@@ -182,7 +183,8 @@ class KeyedDoor:
         return load_pair(make(folder, name)[1])
 
     def admitted(self, name: str, folder: Path) -> Keys:
-        """Make the keys of a second client; return them once the daemon has them on its list."""
+        """Make the keys `name` of a second client in `folder`; return them once the daemon has
+        them on its list."""
         keys = self.client(name, folder)
         (folder / f"{name}.key").rename(self.clients / f"{name}.key")
         self.knows(2)
@@ -193,7 +195,7 @@ class KeyedDoor:
         return self._log.read_text()
 
     def knows(self, number: int) -> None:
-        """Wait until this many keys may connect."""
+        """Wait until `number` keys may connect."""
         wait_until(lambda: re.findall(r"(\d+) keys may", self.said())[-1:] == [str(number)])
 
     def is_deaf(self, subscriber: zmq.Socket[bytes]) -> None:

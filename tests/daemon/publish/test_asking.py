@@ -67,7 +67,8 @@ class Model:
         self.said: list[Said] = []
 
     def ask(self, peer: Peer, envelope: Frames, now_ns: int, *, lifts: bool) -> None:
-        """Keep only a connection's newest question; give up the oldest one for a fourth peer's."""
+        """Take in a question. Keep only a connection's newest; answer the oldest `unknown` if
+        a fourth peer asks. `lifts`: asks if it may lift; else for a judgement."""
         if peer in self.waiting:
             self.withdraw(peer, self.waiting.pop(peer))
         elif len(self.waiting) == MOST:
@@ -80,13 +81,14 @@ class Model:
         self.said.append((question.envelope, ("unknown", [reason])))
 
     def withdraw(self, peer: Peer, question: Waiting) -> None:
-        """Take back an offer that was not answered; its grasp has no owner then."""
+        """Take back the offer of a lift that a question has; the grasp then has no owner."""
         offer, question.offer, question.kept = question.offer, None, None
         if offer is not None and self.book.offered(peer) == named(offer[0]):
             self.book.take_back(named(offer[0]))
 
     def verdict(self, grasp: int, name: str, now_ns: int | None, *, supervised: bool) -> None:
-        """Answer waiting questions; `now_ns`: only those due or waiting for the disk; None: all."""
+        """Answer waiting questions by the verdict `name` on `grasp`. `now_ns`: only those that are
+        due then or wait for the disk; None: all."""
         for peer, question in list(self.waiting.items()):
             if now_ns is None or question.offer or question.due_ns <= now_ns:
                 answer = self.answer(peer, question, grasp, name, supervised=supervised)
@@ -115,9 +117,8 @@ class Model:
         return (name, owner, supervised) if question.kept else None
 
     def may_lift(self, peer: Peer) -> bool:
-        """Return True for a user of the scene, or without any for the first that lifted.
-
-        Its routing id must have 16 bytes.
+        """Return True for a peer whose credential the scene names; if it names none, for the
+        credential that lifted first. The peer's routing id must have 16 bytes.
         """
         lifter = self.book.lifter
         is_same = lifter is None or lifter.credential == peer.credential
@@ -146,7 +147,7 @@ def take(lifts: LiftBook, report: Report) -> bool:
 
 
 def plain(payload: bytes) -> object:
-    """Return the part of an answer that the model predicts."""
+    """Return the part of an answer that `Model` predicts."""
     found: dict[str, Any] = json.loads(payload)
     if "ok" in found:
         return found["ok"]
@@ -159,7 +160,7 @@ def plain(payload: bytes) -> object:
 
 
 class Questioning(RuleBasedStateMachine):
-    """Peers, a hand and a disk, in any order of their actions, and the model beside them."""
+    """Peers, a hand and a disk, in any order of their actions, compared with `Model`."""
 
     @initialize(tells=st.sampled_from((None, {ROBOT}.__contains__)))
     def start(self, tells: Callable[[bytes], bool] | None) -> None:
@@ -257,7 +258,7 @@ class Questioning(RuleBasedStateMachine):
 
     @rule(after_ns=st.sampled_from((1, S // 2, S - 1, S)))
     def wait(self, after_ns: int) -> None:
-        """Let time pass without a reading: questions that are due are answered `unknown`."""
+        """Let `after_ns` pass without a reading: questions that are due are answered `unknown`."""
         self.now_ns += after_ns
         next_ns = self.questions.serve([], self.now_ns, self.loop)
         for peer, question in list(self.model.waiting.items()):

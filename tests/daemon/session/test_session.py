@@ -53,7 +53,10 @@ def test_a_new_session_begins_if_the_kept_does_not_fit(
 
 
 def session_pipeline(age_ns: int = 0, *, learns: bool = True) -> Pipeline:
-    """Return a pipeline without a gate, for which readings made at time 0 are `age_ns` old."""
+    """Return a pipeline without a gate, for which readings made at time 0 are `age_ns` old.
+
+    `learns` False: the session takes in no grasps.
+    """
     model = TactileModel(zoo.find("small-session"))
     return Pipeline(model, FINGERS, Limits(max_age_ns=10**8), lambda: age_ns, learns=learns)
 

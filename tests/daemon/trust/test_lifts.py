@@ -51,7 +51,7 @@ class Lift:
 
 
 class Model:
-    """What a user may rely on, in plain words: the book, the budget, and what is learned."""
+    """Simulates the book of lifts, the budget of slips, and what is learned, in plain code."""
 
     def __init__(self, alpha: float | None) -> None:
         self.alpha, self.budget, self.proven = alpha, 5.0, 0
@@ -64,7 +64,8 @@ class Model:
         self.lifter: Peer | None = None
 
     def judged(self, number: int, lesson: bytes, *, stable: bool) -> None:
-        """The first verdict counts, or the first `stable` one, or the first with features."""
+        """Enter a grasp: its first verdict counts, or the first `stable` one, or the first with
+        features. `lesson`: its features."""
         lift = self.lifts.setdefault(number, Lift(stable, lesson))
         is_better = (stable and not lift.stable) or (lift.lesson == NOT_ASSESSED != lesson)
         if lift.slipped is None and is_better:
@@ -112,7 +113,7 @@ class Model:
 
 
 class Lifts(RuleBasedStateMachine):
-    """Random events for a `Trust`, its controllers, and the model that must agree with it."""
+    """Random events for a `Trust`, its controllers, and the `Model` that must agree with it."""
 
     @initialize(alpha=ALPHAS, most=st.sampled_from((1, 2, 5)))
     def start(self, alpha: float | None, most: int) -> None:
@@ -152,7 +153,7 @@ class Lifts(RuleBasedStateMachine):
 
     @rule(stable=st.booleans(), margin=st.none() | MARGINS)
     def judge_what_cannot_be_assessed(self, stable: bool, margin: float | None) -> None:
-        """The grasp is assessed at the next reading if a `margin` is given."""
+        """Judge a new grasp without features; unless `margin` is None, assess it afterwards."""
         stable = stable and self.model.alpha is None
         self.number += 1
         self.part.note(named(self.number), Assessment(0), stable=stable)

@@ -172,7 +172,7 @@ class Browser:
         return answer["result"].get("value")
 
     def wait_for(self, expression: str, patience_s: float = PATIENCE_S) -> None:
-        """Wait until a script is true."""
+        """Wait until the script `expression` is true; fail after `patience_s`."""
         deadline_s = time.monotonic() + patience_s
         while not self.value(expression):
             text = self.value("document.body.innerText")
@@ -213,7 +213,7 @@ class Browser:
 
 
 def see(browser: Browser, tone: str, *more: str) -> None:
-    """Wait until the first hand has a tone, and all scripts in `more` are true at that moment.
+    """Wait until the first hand has `tone`, and all scripts in `more` are true at that moment.
 
     Scripts that are asked one after the other may see silence: a busy computer stands still.
     """
@@ -221,17 +221,17 @@ def see(browser: Browser, tone: str, *more: str) -> None:
 
 
 def says(element: str, part: str) -> str:
-    """Return a script: does the first element of a class have this text in it?"""
+    """Return a script: does the text of the first element of the class `element` contain `part`?"""
     return f"document.querySelector('.{element}').innerText.includes({json.dumps(part)})"
 
 
 def reads(element: str, whole: str) -> str:
-    """Return a script: has the first element of a class this text and no other?"""
+    """Return a script: is `whole` the text of the first element of the class `element`?"""
     return f"document.querySelector('.{element}').innerText == {json.dumps(whole)}"
 
 
 def text(browser: Browser, element: str) -> str:
-    """Return the text of the first element of a class."""
+    """Return the text of the first element of the class `element`."""
     return str(browser.value(f"document.querySelector('.{element}').innerText"))
 
 

@@ -28,7 +28,7 @@ def endpoint(tmp_path: Path) -> str:
 
 
 def first_of(publisher: Publisher, feed: Feed, seq: int, decision: Decision) -> list[bytes]:
-    """Publish a verdict until messages come; return their payloads."""
+    """Publish a verdict until messages come to `feed`; return their payloads."""
     found: list[bytes] = []
 
     def has_come() -> bool:

@@ -200,7 +200,7 @@ def note_tones(browser: Browser) -> None:
 
 
 def hide(browser: Browser, hidden: str) -> None:
-    """Have the page believe that it is hidden, `true`, or is not."""
+    """Have the page believe that it is hidden. `hidden`: `true` or `false`, in JavaScript."""
     value = f"{{value: {hidden}, configurable: true}}"
     browser.value(f"Object.defineProperty(document, 'hidden', {value})")
 

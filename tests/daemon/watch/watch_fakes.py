@@ -121,7 +121,8 @@ def text_of(
     *,
     colours: bool = False,
 ) -> list[str]:
-    """Return the lines that a terminal shows, with colour codes only if `colours`."""
+    """Return the lines that a terminal of `width` and `height` shows, with colour codes only if
+    `colours`. `chosen`: hand with details. `page`: number of pages to skip."""
     hands = seen if isinstance(seen, list) else [seen]
     file = io.StringIO()
     system: Literal["truecolor"] | None = "truecolor" if colours else None

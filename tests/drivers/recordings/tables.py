@@ -40,7 +40,8 @@ def table(
     columns: Sequence[str] = TABLE_HEADER,
     end: str = "\n",
 ) -> bytes:
-    """A table; `changes` replaces cells by row (from 0) and column name."""
+    """A table of `rows`; `changes` replaces cells by row (from 0) and column name. `end`: that of
+    each line."""
     lines = [",".join(columns)]
     lines += [line(columns, cells(row, (changes or {}).get(row))) for row in range(rows)]
     return "".join(text + end for text in lines).encode()

@@ -190,7 +190,8 @@ def test_a_bag_whose_stamps_stand_still_logs_a_warning(
 
 
 def held(sweeps: list[Sweep], *, same_stamp: bool) -> list[Sweep]:
-    """Sweeps of which the fourth and seventh of each seven repeat the one before."""
+    """Sweeps of which the fourth and seventh of each seven repeat the one before; `same_stamp`:
+    its stamp too."""
     found: list[Sweep] = []
     for number, sweep in enumerate(sweeps):
         if number % 7 in (3, 6):

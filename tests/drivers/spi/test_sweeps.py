@@ -220,7 +220,10 @@ def test_with_batches_a_time_is_right_to_two_milliseconds(drift_ppm: float) -> N
 
 
 def exact(pings: int, wrong_ppm: int = 0) -> tuple[DeviceClock, int]:
-    """A clock after PINGs that took no time, one a second, and the host time of the last, ns."""
+    """A clock after PINGs that took no time, one a second, and the host time of the last, ns.
+
+    `wrong_ppm`: by how much its rate differs from the nominal one.
+    """
     clock = DeviceClock(TICK_HZ, TICK_HZ, START_NS, START_NS)
     for second in range(1, pings):
         now_ns = START_NS + second * S
