@@ -281,7 +281,7 @@ class _Hand:
         keys: Keys | None = None,
         max_p_slip: float = 0.5,
     ) -> None:
-        """`endpoint`: address of verdicts in the scene's `[publish]`. `hand`: `right` or `left`.
+        """`endpoint`: that of the scene's `[publish]`. `hand`: the scene's `hand.name`.
 
         `max_age_ms`: largest age of a reading that permits a lift, ms.
 

@@ -116,7 +116,7 @@ def test_a_port_without_descriptor_is_polled(rig: Rig) -> None:
         assert driver.counters.unknown_frames == 2
 
 
-def test_an_open_socket_has_a_descriptor_and_its_loss_is_noticed() -> None:
+def test_a_socket_has_a_descriptor_and_its_loss_is_noticed() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = f"socket://127.0.0.1:{server.getsockname()[1]}"
         clock = Clock()
