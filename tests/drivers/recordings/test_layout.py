@@ -150,27 +150,28 @@ def test_electrode_names_need_no_finger_if_one_is_read() -> None:
 
 @pytest.mark.parametrize("name", ["finger", "Sensor_ID", "fingertip"])
 @pytest.mark.parametrize("block", [1, 512])
-def test_a_file_with_one_finger_per_row_is_refused(name: str, block: int) -> None:
+@pytest.mark.parametrize("hand", [["ff", "th"], ["ff", "th", "mf", "rf", "lf"]])
+def test_a_file_with_one_finger_per_row_is_refused(
+    name: str, block: int, hand: Sequence[str]
+) -> None:
     generator = np.random.default_rng(1)
     header = ",".join([name, *(f"E{number}" for number in range(1, 25))])
     rows = [
-        ",".join(
-            ["th" if place // block % 2 else "ff", *map(str, generator.integers(4096, size=24))]
-        )
-        for place in range(2 * block)
+        ",".join([hand[place // block % len(hand)], *map(str, generator.integers(4096, size=24))])
+        for place in range(len(hand) * block)
     ]
     content = "\n".join([header, *rows, ""])
     said = refusal(content.encode(), ["ff"])
-    assert f"column {name}: has rows of ff and of th: put all" in said
+    assert f"column {name}: has rows of ff and of {min(hand[1:])}: put all" in said
     said = refusal(content.encode())
     assert f"name no finger, but {name} may: put all fingers into one row" in said
     said = refusal(re.sub(r"E2\d", "x", content).encode(), ["ff"])
     assert "ff has 19 electrodes: a BioTac" in said
-    of_one = content.replace("th,", "ff,").encode()
-    assert len(rows_of(of_one, ["ff"])) == 2 * block
+    of_one = re.sub("^(th|[mrl]f),", "ff,", content, flags=re.MULTILINE).encode()
+    assert len(rows_of(of_one, ["ff"])) == len(rows)
     timed = "\n".join([f"t,{header}", *(f"{0.01 * n},{row}" for n, row in enumerate(rows)), ""])
     for given, rate_hz in ((content, 100.0), (timed, None)):
-        with pytest.raises(RecordingError, match=f"column {name}: has rows of ff and of th"):
+        with pytest.raises(RecordingError, match=f"column {name}: has rows of ff and of"):
             survey(PATH, io.BytesIO(given.encode()), ["ff"], "stream", rate_hz)
 
 
