@@ -158,9 +158,9 @@ class CanBus:
                 frames.append((frame, t_ns, t_ns))
 
     def _count_drops(self, total: int, frames: list[Stamped]) -> None:
-        """Count new drops. `total`: the kernel's running sum of 32 bits.
+        """Count new drops, and append `LOST` to `frames` if there are any.
 
-        The sum rises with the frame after a loss, so `LOST` goes in front of that frame.
+        `total`: the kernel's running sum of drops, 32 bits, that came with the next frame.
         """
         dropped = (total - self._drops_seen) % (1 << 32)
         if dropped:
@@ -217,7 +217,10 @@ class CanBus:
         return t_ns, t_ns
 
     def _notice_quiet(self, now_ns: int, received: bool) -> None:
-        """Set `failure`, so that the bus is reopened, after `QUIET_NS` without a frame."""
+        """Set `failure`, so that the bus is reopened, after `QUIET_NS` without a frame.
+
+        `received`: True if this `drain` received frames.
+        """
         if received:
             self._received_ns = now_ns
         elif now_ns - self._received_ns > QUIET_NS:
@@ -247,8 +250,8 @@ _UNPACK: Final[dict[str, tuple[Callable[[bytes], CanFrame | None], int]]] = {
     "socketcan": (unpack_frame, CAN_FRAME.size + 1),
     "udp_multicast": (_unpack_datagram, DATAGRAM_BYTES_MAX),
 }
-"""Function that unpacks a record, and bytes to read, for interfaces read by their socket. One byte
-more than a frame is read, so that a longer record is not mistaken for a frame."""
+"""By interface read from its socket: function that unpacks a record, and bytes to read of it. For
+socketcan, one byte more than a frame, so that a longer record is not mistaken for a frame."""
 
 
 def _enlarge_buffer(descriptor: int) -> None:

@@ -121,9 +121,10 @@ def open_bus(interface: str, channel: str, **options: Any) -> can.BusABC:  # noq
 
 
 def _open_socketcand(channel: str, host: str, port: int, **options: Any) -> can.BusABC:  # noqa: ANN401
-    """Connect, with `CONNECT_S` at most for each step; `options`: further ones of the bus.
+    """Open a bus of python-can at this server; each step of connecting takes `CONNECT_S` at most.
 
-    python-can alone would wait for ever, or spin for ten seconds.
+    `options`: further arguments of the bus. python-can alone would wait for ever, or spin for ten
+    seconds.
     """
     before_s = socket.getdefaulttimeout()
     socket.create_connection((host, port), CONNECT_S).close()

@@ -27,7 +27,8 @@ _ALL: Final = (1 << ELECTRODES) - 1
 class Held(Enum):
     """Words that a sample's place already has, compared with the sample's.
 
-    Up to the last place of the current sweep they are its own, beyond it those of the sweep before.
+    Up to the furthest place of the current sweep they are of this sweep, beyond it of the one
+    before.
     """
 
     NOTHING = auto()
@@ -73,10 +74,10 @@ def classify(place: int, last: int, timing: Timing, held: Held, *, is_over: bool
 
 
 class _Sweep:
-    """Words of the current sweep by place; beyond its last place those of the sweep before."""
+    """Words of the current sweep by place; beyond its furthest place those of the sweep before."""
 
     def __init__(self, width: int) -> None:
-        """`width`: bytes of a sample's words."""
+        """`width`: bytes of a sample's words, two for each sensor."""
         self.words = bytearray(ELECTRODES * width)
         self._width = width
         self.have = 0
@@ -147,7 +148,7 @@ class SampleAssembler:
 
         `words`: response word of each sensor, two bytes each. The sample arrived at `t_ns`, or
         between `t_ns` and `until_ns` if that is given. If that range is too wide to tell its sweep,
-        the sample is dropped.
+        the sample is dropped and the current sweep ended.
         """
         place = self._place.get(channel)
         if place is None:
@@ -210,9 +211,9 @@ class SampleAssembler:
         return self._finish() if place == ELECTRODES - 1 else ()
 
     def _finish(self, *, begins: bool = False) -> Sequence[TactileReading]:
-        """Return the reading of the current sweep, unless it was returned before.
+        """Return the reading of the current sweep; () if it has none, or was returned before.
 
-        `begins`: another sweep begins.
+        `begins`: True to begin another sweep.
         """
         sweep = self._sweep
         finished: Sequence[TactileReading] = ()

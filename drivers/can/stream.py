@@ -75,7 +75,7 @@ class CanStream:
         `fingers`: the rows of a reading. `sensors`: the fingers in the order of the board's words,
         three at most; None: `fingers`. `arbitration_id`: above 0x7FF it has 29 bits. None: take the
         id of the first sound sample, until the link is lost; for bring-up only. `sequence`: a
-        key of `SEQUENCES`. `data_length`: bytes of a frame that the board pads.
+        key of `SEQUENCES`. `data_length`: bytes of a frame; None: the board does not pad them.
         """
         self.counters = CanCounters()
         self.link = Link(NAME)

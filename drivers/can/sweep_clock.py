@@ -39,14 +39,15 @@ class Timing(Enum):
     """Too early for the current sweep."""
     FITS = auto()
     LATE = auto()
-    """It may be too late for the current sweep."""
+    """The sample may be too late for the current sweep."""
 
 
 class SweepClock:
     """Times of the sweeps of one board; `period_ns` is None until it is known."""
 
     def __init__(self, slots: Sequence[int], samples: int) -> None:
-        """`samples`: number of samples of a sweep. `slots`: index of each electrode's, rising."""
+        """`samples`: number of samples of a sweep. `slots`: index in the sweep of the sample of
+        each place, rising."""
         self.period_ns: int | None = None
         self.t_ns = 0
         """Time of the last sample of the current sweep."""
@@ -68,7 +69,8 @@ class SweepClock:
         self.interrupt()
 
     def interrupt(self) -> None:
-        """Forget the pace of the board. Call after the link broke."""
+        """Forget the last sample, and whether the board pauses between sweeps; keep `period_ns`.
+        Call after the link broke."""
         self._is_steady = False
         """True if the board sweeps without a pause."""
         self.cut()
@@ -97,9 +99,9 @@ class SweepClock:
         return until_ns - t_ns >= self._late_ns
 
     def timing(self, place: int, last: int, until_ns: int) -> Timing:
-        """Compare a sample with the current sweep; `last`: its furthest place.
+        """Compare the time of a sample at `place`, at latest `until_ns`, with the current sweep.
 
-        For a sweep without a sample (`last` is -1) the result does not matter.
+        `last`: furthest place of the sweep; -1 for none, and then the result does not matter.
         """
         if self.period_ns is None:
             late_ns: float = until_ns - self.t_ns - max(place - last, 0) * SLOT_MIN_NS
@@ -112,7 +114,10 @@ class SweepClock:
         return Timing.EARLY if is_early else Timing.FITS
 
     def advance(self, place: int, t_ns: int, *, begins: bool) -> None:
-        """Note the time of a sample whose place is the furthest of the current sweep so far."""
+        """Note the time of a sample whose place is the furthest of the current sweep so far.
+
+        `begins`: True if it is the first of the sweep.
+        """
         origin_ns = t_ns - self._position[place] * (self.period_ns or 0)
         if begins or origin_ns < self._origin_ns:
             self._origin_ns = origin_ns
@@ -130,7 +135,7 @@ class SweepClock:
         return self.t_ns + round(left * self.period_ns)
 
     def end(self, last: int) -> int:
-        """End a sweep whose furthest place is `last`; return the number missed just before it.
+        """End a sweep whose furthest place is `last`; return the number of sweeps lost before it.
 
         The number is 1 after an outage. Two complete sweeps in a row teach the period.
         """

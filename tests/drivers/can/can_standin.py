@@ -31,7 +31,8 @@ class SocketBus:
     """
 
     def __init__(self, *, stamped: bool = False) -> None:
-        """`stamped`: the kernel stamps frames, as of CAN. Else those of one read have one time."""
+        """`stamped`: the kernel stamps each frame, as those of CAN. Else the driver gives all
+        frames of one read the same time."""
         self.socket, self.far_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
         self.socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, stamped)
         self.far_end.setblocking(False)

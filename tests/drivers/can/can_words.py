@@ -32,7 +32,10 @@ def word(count: int) -> bytes:
 
 
 def words_of(counts: NDArray[np.uint16], channel: int) -> bytes:
-    """Words of all fingers for an electrode; for another channel words of the count 2050."""
+    """Words of all fingers for an electrode's channel; for another one words of the count 2050.
+
+    `counts`: shape (fingers, electrodes).
+    """
     if channel not in ELECTRODE_CHANNELS:
         return word(2050) * len(counts)
     return b"".join(word(int(count)) for count in counts[:, channel - E1])

@@ -130,7 +130,7 @@ def test_error_frames_say_what_happened() -> None:
         (CanFrame(0x100, E1_SAMPLE), "accepted_frames"),
     ],
 )
-def test_every_dropped_sample_frame_is_counted_by_its_reason(frame: CanFrame, counter: str) -> None:
+def test_each_frame_raises_exactly_one_counter_by_its_kind(frame: CanFrame, counter: str) -> None:
     made, counters = decoder()
     made.push(frame, 0)
     assert getattr(counters, counter) == 1
@@ -164,7 +164,7 @@ def test_without_a_configured_id_the_first_sound_sample_sets_one(unsound: CanFra
 
 
 @pytest.mark.parametrize("configured", [None, 0x100])
-def test_an_id_that_was_learned_is_forgotten_with_the_link(configured: int | None) -> None:
+def test_interrupt_forgets_a_learned_id_but_keeps_a_configured_one(configured: int | None) -> None:
     made, counters = decoder(configured)
     made.push(CanFrame(0x100, E1_SAMPLE), 0)
     made.interrupt()
@@ -226,14 +226,16 @@ def test_words_in_sensor_order_fill_rows_in_finger_order(fingers: Sequence[str])
     ("sensors", "says"),
     [(("ff", "mf"), "not in"), (("ff", "mf", "th", "rf"), "9 bytes cannot carry 4 sensors")],
 )
-def test_sensors_without_a_finger_or_too_many_are_refused(
+def test_sensors_that_lack_a_finger_or_are_four_are_refused(
     sensors: Sequence[str], says: str
 ) -> None:
     with pytest.raises(ValueError, match=says):
         CanStream("bus", ("ff", "mf", "th"), sensors=sensors)
 
 
-def test_a_package_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_opening_udp_multicast_without_its_package_names_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr("can.interfaces.udp_multicast.utils.msgpack", None)
     says = rf"more packages: run {sys.executable} -m pip install 'python-can\[multicast\]'$"
     with pytest.raises(DriverError, match=says) as raised:
@@ -250,7 +252,7 @@ def test_a_package_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> 
         ("kvaser", r"needs the library libcanlib\.so"),
     ],
 )
-def test_an_interface_without_its_package_is_refused(
+def test_an_interface_without_its_package_or_library_is_refused(
     monkeypatch: pytest.MonkeyPatch, interface: str, says: str
 ) -> None:
     monkeypatch.setattr("graspd.drivers.can.interfaces.find_spec", lambda _name: None)

@@ -218,7 +218,9 @@ def test_an_unstamped_frame_arrived_since_the_bus_was_last_empty(
     bus.close()
 
 
-def test_server_stamps_date_frames_by_the_quickest_delay(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rising_socketcand_stamps_date_frames_by_the_quickest_delay(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     scripted, clock = ScriptedBus(), Clock(1_000 * MS)
     monkeypatch.setattr("graspd.drivers.can.bus.open_bus", lambda *_, **__: scripted)
     bus = CanBus("socketcand", "x", None, clock, Clock(0), {"host": "127.0.0.1", "port": 1})
@@ -309,7 +311,7 @@ def test_a_socketcand_server_silent_for_2_s_is_reconnected() -> None:
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_a_server_that_is_absent_or_silent_is_waited_for() -> None:
+def test_a_socketcand_server_absent_or_silent_is_waited_for() -> None:
     clock = Clock()
     with socket.create_server(("127.0.0.1", 0)) as silent:
         for port in (free_port(), silent.getsockname()[1]):

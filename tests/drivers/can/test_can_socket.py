@@ -64,7 +64,7 @@ def test_a_socketcan_bus_is_read_from_its_socket(socket_bus: SocketBus) -> None:
 @pytest.mark.parametrize(
     ("step_ns", "age_ns"), [(3_600_000 * MS, 3_600_000 * MS), (-5_000 * MS, 0)]
 )
-def test_a_wall_clock_step_makes_no_frame_of_the_future(
+def test_a_wall_clock_step_makes_frames_old_but_never_future(
     stamped_bus: SocketBus, step_ns: int, age_ns: int
 ) -> None:
     with over_socket(wall_clock=lambda: time.time_ns() + step_ns) as driver:
@@ -77,7 +77,7 @@ def test_a_wall_clock_step_makes_no_frame_of_the_future(
     assert before_ns - between_ns <= readings[-1].t_ns + age_ns <= read_ns
 
 
-def test_bus_off_loses_the_link_and_its_sweep(
+def test_bus_off_drops_the_sweep_and_reopens_the_bus(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     clock = Clock()

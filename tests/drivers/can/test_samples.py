@@ -66,7 +66,7 @@ def test_only_a_sweep_with_samples_counts_as_cut() -> None:
     assert counters.cut_sweeps == 1
 
 
-def test_only_a_link_that_broke_between_readings_interrupts_them() -> None:
+def test_a_break_between_readings_marks_only_the_next_as_interrupted() -> None:
     sweeps, _ = assembler()
     sweeps.interrupt()
     readings = feed(sweeps, samples(0))
@@ -172,7 +172,7 @@ def test_losses_are_counted_exactly_if_all_sweeps_have_equal_words(lost: int) ->
 def test_an_unknown_period_counts_as_that_of_the_fastest_board(
     place: int, after_ns: int, is_next: bool
 ) -> None:
-    """100 us a sample: three quarters of a sweep are 1800 us, after the time to that place."""
+    """At 100 us a sample, 3/4 of a sweep are 1800 us, added to the time to that place."""
     sweeps, _ = assembler()
     begun, late = samples(0)[:5], samples(0)[place]
     readings = feed(sweeps, [*begun, (*late[:2], begun[-1][2] + after_ns)])
@@ -277,7 +277,8 @@ PLACES: dict[str, Callable[[int, int], bool]] = {
     "far back": lambda place, last: place < last - 3,
     "jump": lambda place, last: place in (21, 22, 23) and last in (0, 1, 2),
 }
-"""Meaning of the page's words for a sample's place, given that place and the furthest, from 0."""
+"""By words of `PAGE` for a sample's place: are they true of this place and the furthest one, both
+from 0?"""
 OUT = ", reading has ended"
 TIMES = {"any": set(Timing), "late": {Timing.LATE}, "early": {Timing.EARLY}}
 HELD = {
