@@ -64,7 +64,10 @@ class JointStream:
         """Do nothing: the last number and time stay, so that no old message is mistaken for new."""
 
     def receive(self, data: bytes, t_ns: int) -> list[JointReading] | None:
-        """Return the reading; [] if no joint is known; None if the message is dropped."""
+        """Return the reading of a message; [] if no joint is known; None if it is dropped.
+
+        `t_ns`: time of arrival, which becomes the reading's.
+        """
         message, restarts = self.parse(data), self.counters.restarts
         if message is None or not self._order.admits(message.stamp):
             return None

@@ -69,7 +69,10 @@ class Message(NamedTuple):
 
 
 def write_message(stamp: Stamp, **fields: object) -> bytes:
-    """Return the datagram; fields that are None are left out. Raises `ValueError` for NaN."""
+    """Return the datagram of a JSON object with `stamp` as `seq` and `t`, and `fields`.
+
+    Fields of None are left out. Raises `ValueError` for NaN.
+    """
     whole = {"seq": stamp.seq, "t": stamp.t_s, **fields}
     message = {name: value for name, value in whole.items() if value is not None}
     return json.dumps(message, allow_nan=False, separators=(",", ":")).encode()
@@ -78,7 +81,8 @@ def write_message(stamp: Stamp, **fields: object) -> bytes:
 def read_message(data: bytes, key: str, counters: MessageCounters) -> Message | None:
     """Return a datagram's message, whose values are the object `key`; None if it is not valid.
 
-    Invalid messages are counted, and the log says what is wrong with the first.
+    Invalid messages are counted, and the log says what is wrong with the first. If `key` is
+    `counts`, the message must have `seq` or `t`.
     """
     try:
         return _message(data, key)
@@ -132,7 +136,10 @@ class Order:
         self._old_in_a_row = 0
 
     def admits(self, stamp: Stamp) -> bool:
-        """Return True if the message is newer than all before, or the first after a restart."""
+        """Return True if the message is newer than all before, or the first after a restart.
+
+        Counts old messages, restarts, and messages missed before this one.
+        """
         if not stamp.is_after(self._last):
             if not self._has_restarted(stamp):
                 self._counters.old_messages += 1

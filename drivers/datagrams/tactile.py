@@ -38,7 +38,7 @@ class TactileCounters(MessageCounters):
     other_hands: int = 0
     """Messages that name another hand; dropped."""
     late_messages: int = 0
-    """Messages that took 100 ms longer than the quickest one; their readings have that age."""
+    """Messages that took over 100 ms longer than the quickest; their readings have that age."""
     absent_fingers: int = 0
     """Fingers of the hand that a message lacks, or with all counts 0 or all 4095."""
     wrong_sizes: int = 0
@@ -67,7 +67,10 @@ class TactileStream:
         self._interrupted = self.counters.readings > 0
 
     def receive(self, data: bytes, t_ns: int) -> list[TactileReading] | None:
-        """Return the reading of a message; None if the message is dropped."""
+        """Return the reading of a message that arrived at `t_ns`; None if it is dropped.
+
+        The reading's time is when the message was made, by its `t` and the quickest message.
+        """
         counters = self.counters
         message = read_message(data, "counts", counters)
         if message is None:
@@ -158,7 +161,7 @@ class TactileStreamDriver(DatagramDriver[TactileStream]):
     ) -> None:
         """`source`: `udp://ADDRESS:PORT` to receive on. `fingers`: the rows of a reading. `hand`:
         its name; messages that name another one are dropped. `only_from`: IP address whose
-        datagrams are taken; None: any."""
+        datagrams are taken; None: any. `clock`: monotonic ns."""
         self._fingers = tuple(fingers)
         self._hand = hand
         super().__init__(source, only_from=only_from, clock=clock)

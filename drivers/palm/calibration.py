@@ -132,7 +132,10 @@ class JointCalibration:
     coupled: CoupledTable | None = None
 
     def angles_rad(self, sensors: Sequence[int]) -> NDArray[np.float64]:
-        """Return the angles of `JOINTS`, radians; NaN without a table or a valid raw value."""
+        """Return the angles of `JOINTS`, radians; NaN without a table or a valid raw value.
+
+        `sensors`: as in `PalmPacket`.
+        """
         angles = dict.fromkeys(JOINTS, math.nan)
         for joint, table in self.tables.items():
             raw = _raw(sensors, HALL_SENSORS[joint])

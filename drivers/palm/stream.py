@@ -181,7 +181,8 @@ class PalmStream:
         return (*finished, self._finish()) if self._have == _COMPLETE else finished
 
     def _is_duplicate(self, packet: PalmPacket, position: int, t_ns: int) -> bool:
-        """Return True for a copy of a packet of this round, False for an equal one of the next."""
+        """Return True for a copy of a packet of this round, False for a packet that differs, or
+        arrives when an equal one of the next round may."""
         if self.packets[position] != packet or self._place is None or self._place_t_ns is None:
             return False
         elapsed_ns = t_ns - self._place_t_ns
@@ -277,7 +278,8 @@ class PalmStream:
         return TactileReading(self._t_ns, self._round, counts, faults, interrupted=interrupted)
 
     def _drop_absent_fingers(self) -> None:
-        """Flag fingers without a sensor: their words are unwritten memory, over 4095 or all 0."""
+        """Flag fingers without a sensor `MISSING`: their words are unwritten memory, with pressure
+        or temperature over 4095, or all electrodes 0."""
         silent: NDArray[np.bool_] = ((self._counts == 0) & (self._faults == 0)).all(axis=1)
         absent = np.array(self._absent)
         if self._have & _TELLING != _TELLING:

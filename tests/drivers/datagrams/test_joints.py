@@ -109,7 +109,7 @@ def test_a_gap_of_over_a_thousand_counts_as_restart(step: int, missed: int, rest
     assert (counters.missed_readings, counters.restarts) == (missed, restarts)
 
 
-def test_a_message_is_a_reading_and_a_gap_a_loss(
+def test_messages_give_readings_and_seq_gaps_count_as_missed(
     driver: JointStreamDriver, receiver: Receiver
 ) -> None:
     receiver.send(*(message(seq, FFJ3=seq / 100) for seq in (3, 4, 7, 8)))

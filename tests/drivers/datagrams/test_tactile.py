@@ -49,7 +49,7 @@ def received(*data: bytes) -> tuple[list[TactileReading], dict[str, int]]:
         {"seq": (1 << 63) - 1, "pad": " " * (4096 - len(message(seq=(1 << 63) - 1, pad="")))},
     ],
 )
-def test_a_message_is_a_reading(fields: dict[str, object]) -> None:
+def test_a_valid_message_gives_a_reading_without_faults(fields: dict[str, object]) -> None:
     (reading,), counters = received(message(**fields))
     assert reading.counts.tolist() in ([COUNTS] * 3, [[2795] * 24] * 3)
     assert not reading.faults.any()
@@ -233,7 +233,9 @@ def test_the_first_reading_after_restart_or_outage_is_interrupted() -> None:
         ([0.01, 0.02, 0.03, 0.331], [False] * 3),
     ],
 )
-def test_sender_time_that_leaps_is_dropped(times: list[float], interrupted: list[bool]) -> None:
+def test_messages_whose_sender_time_leaps_are_dropped(
+    times: list[float], interrupted: list[bool]
+) -> None:
     readings, counters = received(*[message(seq=n, t=t_s) for n, t_s in enumerate(times)])
     assert [reading.interrupted for reading in readings] == interrupted
     assert counters.get("bad_messages", 0) == 4 - len(interrupted)
@@ -245,7 +247,7 @@ def driver(receiver: Receiver, clock: Clock) -> Iterator[TactileStreamDriver]:
         yield driver
 
 
-def test_gaps_are_losses_and_new_senders_are_other_sensors(
+def test_seq_gaps_are_losses_and_another_sender_has_other_serials(
     driver: TactileStreamDriver, receiver: Receiver, clock: Clock
 ) -> None:
     receiver.send(message(seq=3), message(seq=4), message(seq=7))
@@ -268,10 +270,10 @@ def test_gaps_are_losses_and_new_senders_are_other_sensors(
 PERIOD_NS = 10_000_000
 START_S = 70.0
 ACTIONS = ("send", "lose", "copy", "late", "stall", "stale")
-"""What happens to a sweep's message. `late`: others overtake it; `stall`: those behind it wait as
-well; `stale`: it repeats the time of the one before."""
+"""What happens to a sweep's message. `copy`: it comes again later; `late`: others overtake it;
+`stall`: those behind it wait as well; `stale`: it repeats the time of the one before."""
 Plan = list[tuple[str, int]]
-"""For each sweep an action, and for how many periods it is held back."""
+"""For each sweep an action, and for how many periods its message, or the copy, is held back."""
 
 
 @st.composite

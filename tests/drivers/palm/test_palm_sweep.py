@@ -150,7 +150,9 @@ def test_a_damaged_tactile_type_flags_readings_and_moves_no_values() -> None:
         *((kind, "unknown_types") for kind in (0, 2, 0x1D, 0xFFF8, 0x10000)),
     ],
 )
-def test_a_packet_without_samples_takes_no_place(tactile_type: int, counter: str) -> None:
+def test_a_packet_without_samples_is_counted_and_changes_no_reading(
+    tactile_type: int, counter: str
+) -> None:
     stream = packets(3)
     other = change(stream[0], "ff", {}, tactile_type=tactile_type)
     played = play_packets([*stream[:20], other, *stream[20:]])
@@ -292,7 +294,9 @@ def driver(receiver: Receiver, clock: Clock) -> Iterator[PalmDriver]:
         yield driver
 
 
-def test_another_kind_of_palm_is_not_mixed_in(driver: PalmDriver, receiver: Receiver) -> None:
+def test_packets_of_another_kind_of_palm_are_dropped(
+    driver: PalmDriver, receiver: Receiver
+) -> None:
     for one, two in zip(datagrams(2), datagrams(2, Palm.PALM_0230), strict=True):
         receiver.send(one, two)
     readings = tactile(driver.read_ready())
@@ -300,7 +304,9 @@ def test_another_kind_of_palm_is_not_mixed_in(driver: PalmDriver, receiver: Rece
     assert driver.stream.counters.other_palms == 2 * ROUND
 
 
-def test_a_round_wakes_the_loop_once(driver: PalmDriver, receiver: Receiver, clock: Clock) -> None:
+def test_the_driver_rests_until_two_cycles_before_a_rounds_end(
+    driver: PalmDriver, receiver: Receiver, clock: Clock
+) -> None:
     assert driver.fileno() is not None
     receiver.send(datagrams(1)[0])
     driver.read_ready()
@@ -311,7 +317,9 @@ def test_a_round_wakes_the_loop_once(driver: PalmDriver, receiver: Receiver, clo
     assert driver.due_ns() == clock.now_ns + (10 * ROUND - 11) * MS
 
 
-def test_joints_come_calibrated_at_their_own_rate(receiver: Receiver, clock: Clock) -> None:
+def test_joint_readings_are_calibrated_and_come_every_10_ms(
+    receiver: Receiver, clock: Clock
+) -> None:
     readings = []
     with PalmDriver(LOOPBACK, calibration=EXAMPLE, clock=clock) as driver:
         for data in datagrams(72)[:1000]:
