@@ -51,7 +51,8 @@ class CanTwin(Opened):
     ) -> None:
         """`counts`: of each sweep, shape (fingers, 24). `fingers`: finger of each of these rows.
         `sequence`: a key of `SEQUENCES`. `rate_hz`: sweeps per second of `serve`. Raises
-        `ValueError`, also for an interface that cannot be used here."""
+        `ValueError` for a rate not above 0 or over 1000, a fault that CAN cannot have, or an
+        interface that cannot be used here."""
         if not 0.0 < rate_hz <= 1000.0:
             raise ValueError(f"rate_hz is {rate_hz}, must be above 0 and at most 1000")
         refuse_unusable(interface, channel, None, {})
@@ -108,7 +109,8 @@ class CanTwin(Opened):
             due_ns = max(due_ns + self._period_ns, self._clock() - self._period_ns)
 
     def next_frames(self) -> list[Outgoing]:
-        """Return the frames of the next sweep, without link faults; [] after the last sweep."""
+        """Return (id, data) of the frames of the next sweep, without link faults; [] after the
+        last."""
         counts = next(self._counts, None)
         if counts is None:
             return []
@@ -119,7 +121,8 @@ class CanTwin(Opened):
         return frames
 
     def _word(self, row: int, channel: int, counts: Counts) -> bytes:
-        """Return the response word of a finger's sensor, with its faults."""
+        """Return the response word for `channel`, two bytes, of the sensor in `row` of `counts`,
+        with its faults."""
         if row in self._faults.unplugged_fingers:
             return _UNDRIVEN
         if channel in OTHER_COUNTS:
@@ -136,7 +139,8 @@ class CanTwin(Opened):
         return True
 
     def _put_all(self, frames: Sequence[bytes]) -> None:
-        """Put frames on the bus; count in `unsent` those that it refuses."""
+        """Put frames, `ID_BYTES` of id and then data, on the bus; count in `unsent` those that it
+        refuses."""
         if self._bus is None:
             raise RuntimeError("the twin is not open")
         for frame in frames:

@@ -79,7 +79,7 @@ class DatagramTwin(ABC):
         """Yield the datagram of each cycle, without faults of the link."""
 
     def cycles(self) -> Iterator[list[bytes]]:
-        """Yield the datagrams of each cycle, with faults of the link."""
+        """Yield the datagrams of each cycle, with faults of the link; last those held back."""
         silent = 0
         for data in self.datagrams():
             if silent:
@@ -225,7 +225,9 @@ class TactileTwin(MessageTwin):
         rate_hz: float = RATE_HZ,
         faults: LinkFaults = LinkFaults(),  # noqa: B008 (immutable)
     ) -> None:
-        """Raises `ValueError` for a rate, 1/s, or a fault that messages of counts cannot have."""
+        """`fingers`: finger of each row of the counts. `rate_hz`: messages per second. Raises
+        `ValueError` for a rate not above 0 or over 1000, or a fault that messages of counts cannot
+        have."""
         if not 0.0 < rate_hz <= 1000.0:
             raise ValueError(f"rate_hz is {rate_hz}, must be above 0 and at most 1000")
         faults.refuse("the tactile stream", "one_byte_at_a_time", "wrong_version")

@@ -35,7 +35,7 @@ class Network(Protocol):
     """Interface of a network that judges one input: a loaded model, or a trained system."""
 
     inputs: InputBuilder
-    """Makes the input of counts."""
+    """Makes the input from counts."""
     input: NDArray[np.float32]
     """Buffer of the input, shape `inputs.shape`."""
 
@@ -197,7 +197,8 @@ class GraspJudge:
         self.session.observe(examined.grasp, slip=slip)
 
     def prepare(self, counts: NDArray[np.generic]) -> NDArray[np.float64]:
-        """Write the network's input for counts (fingers, 24); return each finger's spread."""
+        """Write the network's input for counts (fingers, 24) into its buffer; return the standard
+        deviation of each finger's counts."""
         inputs, session = self._network.inputs, self.session
         if session is not None and isinstance(inputs, SessionBuilder):
             inputs.use(session.features_mean, session.features_spread)
@@ -214,13 +215,17 @@ def _as_read(
     broken: NDArray[np.bool_],
     session: SessionCalibration | None,
 ) -> NDArray[np.generic]:
-    """Return counts with `broken` electrodes as today's sensors would read their `values`."""
+    """Return `counts`; `broken` electrodes have what today's sensors would read for `values`.
+
+    `values`: counts as the training's sensors read them. `session`: None: today's read the same.
+    """
     expected = values if session is None else session.from_training(values)
     return np.where(broken, np.clip(expected, 0.0, COUNT_MAX), counts)
 
 
 def _is_flat(values: NDArray[np.float64], broken: NDArray[np.bool_] | None) -> bool:
-    """Return True if the sound electrodes of some finger read about the same counts, `values`."""
+    """Return True if in some finger the standard deviation of `values`, counts, over its sound
+    electrodes is below `FLAT_SPREAD_COUNTS`. `broken`: None: all are sound."""
     numbers = [ELECTRODES] * len(values)
     if broken is not None:
         values = np.where(broken, 0.0, values)

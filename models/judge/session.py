@@ -30,7 +30,8 @@ class SessionCalibration:
     odd: bool
     """True if, by `is_odd`, the session cannot have come from grasps of these fingers."""
     temperature: float
-    """Divisor of the network's log-odds of slip, above 1 while the session has few grasps."""
+    """Divisor of the network's log-odds of slip, above 1 while the session has few grasps, or is
+    `odd`."""
 
     def __init__(
         self,

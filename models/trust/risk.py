@@ -68,7 +68,7 @@ class RiskState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class RiskOutcomes(NamedTuple):
-    """Outcomes of `stable` lifts at one moment; `RiskReport` of the messages explains them."""
+    """Outcomes of `stable` lifts at one moment; `RiskReport` (daemon/publish) explains them."""
 
     target: float | None
     lifts: int
@@ -146,7 +146,7 @@ class Risk:
 
     @property
     def threshold(self) -> float:
-        """Highest log-odds of slip that may be called `stable` now; -inf: none."""
+        """Highest log-odds of slip that may be called `stable` now; -inf: none; inf: no rule."""
         alpha = self.limits.max_slip_when_stable
         if alpha is None:
             return math.inf
@@ -190,8 +190,8 @@ class Risk:
         return Permission.UNPROVEN if awaited >= self.limits.outstanding_max else Permission.ALLOWED
 
     def supervised(self, permission: Permission, seed: str, grasp: int) -> bool:
-        """Return True to request a lift under supervision. A withheld grasp is drawn with the
-        probability `explore`; `seed` and `grasp` decide the draw."""
+        """Return True to request a lift under supervision: of each unproven grasp, and of withheld
+        ones with the probability `explore`, drawn by a hash of `seed` and `grasp`, its number."""
         if permission is not Permission.WITHHELD:
             return permission is Permission.UNPROVEN
         digest = hashlib.blake2b(f"{seed} {grasp}".encode(), digest_size=8).digest()
@@ -212,7 +212,8 @@ class Risk:
             self.budget = min(self.budget + alpha - slipped, BUDGET_MAX)
 
     def take_untold(self) -> None:
-        """Count an announced lift as a slip, because its outcome can no longer come."""
+        """Count an announced lift as a slip, because its outcome can no longer come; without
+        `max_slip_when_stable` do nothing."""
         if self.limits.max_slip_when_stable is not None:
             self.take(stable=True, slipped=True, proves=False)
 

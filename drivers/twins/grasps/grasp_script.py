@@ -54,7 +54,7 @@ class Durations:
     release_s: Range = (0.2, 0.3)
     """Time from the start of opening to no contact; faster than closing."""
     rest_s: Range = (0.8, 1.5)
-    """Time from the release to the next approach."""
+    """Time from the end of opening to the next approach."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,7 +137,8 @@ class GraspScript:
         )
 
     def deviation(self, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return counts minus those at rest, shape (fingers, 24), at times `t_s`, () or (24,)."""
+        """Return counts minus those at rest, shape (fingers, 24). `t_s`: times, s, shape () for
+        all, or (24,) for one of each electrode."""
         timetable = self.timetable
         if t_s.max() <= min(timetable.touched_s) or t_s.min() >= timetable.open_s:
             return np.zeros_like(self._deviation)

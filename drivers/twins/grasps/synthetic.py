@@ -62,7 +62,7 @@ class SyntheticGrasps:
 
 
 def draw(model: GraspMixtures, rng: np.random.Generator, grasps: int) -> SyntheticGrasps:
-    """Sample grasps from the mixtures of both classes, half of them slips, shuffled."""
+    """Draw a number, `grasps`, from the mixtures of both classes, half of them slips, shuffled."""
     slipped = rng.permutation(np.arange(grasps) % 2 == 1)
     counts = np.zeros((grasps, COUNTS), dtype=np.uint16)
     component = np.zeros(grasps, dtype=np.int64)

@@ -85,7 +85,7 @@ class WholeGrasps:
         loop: bool = False,
         seed: int = 0,
     ) -> None:
-        """Raises `ValueError` for a wrong rate.
+        """Raises `ValueError` for a rate not above 0, or with `held` for another than `RATE_HZ`.
 
         `rest`: untouched counts, shape (fingers, 24). `end_points`: those of the grasps. `held`:
         2 of 7 rows repeat values, as in recordings at 100 Hz. `rate_hz`: rows/s. `noise`: makes the
@@ -238,7 +238,10 @@ def synthetic_grasps(
     loop: bool = False,
     seed: int = 0,
 ) -> WholeGrasps:
-    """Return a stream of synthetic grasps, half of them slips. Raises `ValueError` for a rate."""
+    """Return a stream of synthetic grasps, half of them slips. Raises `ValueError` for a rate.
+
+    `grasps`: number of different ones. The other arguments are those of `WholeGrasps`.
+    """
     model = synthetic.read_model()
     rng = np.random.default_rng([seed, 2])
     shape = (-1, len(TABLE_FINGERS), ELECTRODES)

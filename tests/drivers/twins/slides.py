@@ -78,9 +78,9 @@ class Hold:
     ) -> None:
         """`sliding` says of each finger whether the object slides along it, or is held.
 
-        Nothing moves before `rest_s`. Slides begin at `slide_s`, and the object is held until then;
-        None: they begin after a standstill. With a `slide_spread` of 0 all have the speed of the
-        median one.
+        `seconds`: length of the motion. Nothing moves before `rest_s`. Slides begin at `slide_s`,
+        and the object is held until then; None: they begin after a standstill. With a
+        `slide_spread` of 0 all have the speed of the median one.
         """
         self._times = np.arange(0.0, seconds + STEP_S, STEP_S)
         ways = [

@@ -70,7 +70,7 @@ def test_a_margin_is_the_finite_log_odds_of_slip(p_slip: float) -> None:
         (0.5, math.nan, False),
     ],
 )
-def test_probabilities_are_in_0_to_1_and_sum_to_one(
+def test_out_of_range_probabilities_or_sums_unlike_one_are_refused(
     p_stable: float, p_slip: float, sound: bool
 ) -> None:
     opinion = judge_of(Answers(p_stable, p_slip)).judge(Examined(COUNTS))
@@ -94,7 +94,7 @@ def test_a_young_session_moves_probabilities_towards_the_threshold(
     assert opinion.margin == pytest.approx(logit(p_slip)), "the margin is that of the network"
 
 
-def test_a_refused_grasp_is_kept_from_the_network() -> None:
+def test_a_refused_grasp_is_not_passed_to_the_network() -> None:
     model = FakeModel()
     opinion = judge_of(model).judge(Examined(COUNTS, Refusal.NEVER_SEEN, ("ff_1",), COUNTS))
     assert (opinion.p_slip, opinion.refusal, opinion.repaired) == (

@@ -39,7 +39,7 @@ def grasps(number: int, mean: float = MEAN, spread: float = SPREAD) -> NDArray[n
     ("number", "calibrated", "temperature"),
     [(0, False, 2.5), (1, False, 2.0), (2, False, 1.5), (3, True, 1.5), (4, True, 1.0)],
 )
-def test_a_session_is_calibrated_after_the_grasps_of_its_card(
+def test_a_session_is_calibrated_from_the_number_of_grasps_configured(
     number: int, calibrated: bool, temperature: float
 ) -> None:
     session = new_session()
@@ -89,7 +89,7 @@ def test_the_training_weighs_as_much_as_one_session_grasp() -> None:
     ("mean", "possible"), [(0.0, True), (4095.0, True), (-0.1, False), (4095.1, False)]
 )
 @pytest.mark.parametrize("place", [78, 78 + 71])
-def test_kept_means_outside_0_to_4095_are_refused(mean: float, possible: bool, place: int) -> None:
+def test_saved_means_outside_0_to_4095_are_refused(mean: float, possible: bool, place: int) -> None:
     session = new_session()
     for counts in grasps(5):
         session.observe(counts)

@@ -15,12 +15,12 @@ TEMPERATURE, SCALE, DRIFT = Number("2"), Number("2.8"), Number("0.002")
 MOVE_MAX, WEIGHTS_MOVE_MAX = Number("1.25"), Number("0.5")
 """Most standard deviations by which an outcome moves its grasp's log-odds: in all, by weights."""
 SHARED, OWN, REACH = Number("9"), Number("0.009"), Number("0.5")
-"""Variances of the residual, shared and a grasp's own, and how far it reaches."""
+"""Variances of the residual, shared and a grasp's own, and the length scale of its kernel."""
 PI = Number("3.14159265358979323846264338327950288")
 
 
 class Reference:
-    """Mean and covariance of the weights, then of the residual at each grasp of the stream."""
+    """Reference learner: `mean`, `covariance` of its weights, then of each grasp's residual."""
 
     def __init__(
         self, margins: list[float], inputs: NDArray[np.float32], drift: Number = DRIFT

@@ -62,7 +62,7 @@ KINDS: dict[str, Callable[[np.random.Generator, int], tuple[float, ArrayLike, bo
     "against the margin": lambda _, at: (-30.0, CLIP * np.eye(26)[at % ONE_FINGER], True),
     "all in turns": lambda random, at: list(KINDS.values())[at // 100 % 5](random, at),
 }
-"""Margin, inputs and outcome of a lift, by its number."""
+"""By kind of stream: function that draws margin, inputs and outcome of a lift, by its number."""
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -108,7 +108,9 @@ def test_the_warm_up_requests_supervised_lifts_of_unsure_grasps() -> None:
 
 
 @pytest.mark.parametrize(("known", "left"), [(1.5, 1.5), (-9.0, -2.0), (8.0, 3.2), (None, 3.2)])
-def test_sensors_that_return_add_nothing_to_the_budget(known: float | None, left: float) -> None:
+def test_an_exchange_may_lower_but_never_raises_the_budget(
+    known: float | None, left: float
+) -> None:
     """Two of two lifts slip under a share of 0.1: 3.2 of 5 slips are left."""
     rule = risk(0.1)
     for _ in range(2):
