@@ -78,7 +78,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
-    """Return a function that runs the command. Raises `SystemExit` for a wrong command line."""
+    """Return a function that runs the command and returns its exit code.
+
+    `arguments` None: those of the process. Raises `SystemExit` for a wrong command line and after
+    `--help` or `--version`.
+    """
     arguments = sys.argv[1:] if arguments is None else arguments
     named = next((word for word in arguments if not word.startswith("-")), None)
     if named in LINUX and not is_linux():

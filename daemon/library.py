@@ -143,7 +143,10 @@ class GraspModel:
     def _begin(
         self, session: str | os.PathLike[str] | ArrayLike | None, read_as: ReadAs | None
     ) -> None:
-        """Calibrate by `session` from the start; warn if the model needs more grasps."""
+        """Reset the calibration, then calibrate by `session`; warn if the model needs more grasps.
+
+        Raises `ModelError` for a session if the model keeps none.
+        """
         calibration = self._judge.session
         if calibration is None or not isinstance(self._takes, SessionInput):
             if session is not None:
@@ -188,7 +191,7 @@ def _grasps(
 
 
 def _refuse_fingers_by_row(table: Any, names: Sequence[str]) -> None:  # noqa: ANN401
-    """Raise `ValueError` if the columns have electrodes of one finger, and the rows name more."""
+    """Raise `ValueError` if the columns are one finger's, and the column of fingers names more."""
     column = finger_column(names)
     if column is None or len(fingers_of(names)) > 1:
         return
@@ -222,8 +225,8 @@ def _time_of(table: Any) -> str | None:  # noqa: ANN401
 def load(model: str | os.PathLike[str], *, fingers: Sequence[Finger] = ()) -> GraspModel:
     """Return a model by its name (`graspd models` lists them) or by the path of an ONNX file.
 
-    `fingers`: those of the hand, in the order of the counts, to load the form of the model for a
-    hand that has fewer. Raises `ModelError`, also for another order than the model's, and
+    `fingers`: those of the hand, in the order of the counts, to load the model's file for a hand
+    with only some of its fingers. Raises `ModelError`, also for another order than the model's, and
     `ValueError` for a name that is not a finger's.
     """
     check_fingers(fingers)
@@ -277,7 +280,7 @@ def judge(
 
 
 def _files(recordings: Any, stack: ExitStack) -> list[Path]:  # noqa: ANN401
-    """Return the paths of recordings; a table is written into a file until `stack` closes."""
+    """Return the paths of `recordings`; a table is in a temporary file until `stack` closes."""
     if column_names(recordings):
         _refuse_coarse(recordings, _time_of(recordings))
         path = write_csv(recordings, stack.enter_context(TemporaryDirectory()))
@@ -312,7 +315,7 @@ def _refuse_coarse(table: Any, time: str | None) -> None:  # noqa: ANN401
 
 @contextmanager
 def _named_as_given(path: Path) -> Iterator[None]:
-    """Make errors name the given table instead of the temporary file at `path`."""
+    """Raise `ValueError`, which names the given table, for an error that names the file `path`."""
     try:
         yield
     except (RecordingError, SceneError) as error:

@@ -110,8 +110,8 @@ class LiftBookState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class LiftBook:
     """The last `LIFTS_MAX` judged grasps, and who may report how their lifts ended.
 
-    A peer that was answered that it may lift a grasp owns it and reports its outcome. Once that
-    peer has ended, another peer with the same credential that may lift reports for it.
+    A peer that was answered that it may lift a grasp owns it and reports its outcome. The last
+    such peer also reports for owners with its credential, which may have ended.
     """
 
     def __init__(self) -> None:
@@ -200,8 +200,8 @@ class LiftBook:
         self.on_announced(True)
 
     def take_back(self, grasp: GraspId | None) -> bool:
-        """Note that no lift of a grasp follows, and remove its owner. None: the last announced
-        grasp.
+        """Note that no lift of a grasp follows, and remove its owner. None: the newest announced
+        grasp without outcome.
 
         Return False, and change nothing, if its outcome is known or the grasp is not in the book.
         """
@@ -224,7 +224,7 @@ class LiftBook:
         return None
 
     def withdraw(self) -> None:
-        """Take back all announcements, because another risk is set, which counts from the start."""
+        """Mark all lifts as not announced, as another risk is set, which counts from the start."""
         self._lifts = {grasp: replace(lift, announced=False) for grasp, lift in self._lifts.items()}
         self.announced = 0
         self._count()
@@ -247,7 +247,8 @@ class LiftBook:
         return is_heir and self.lifter is not None and self.lifter.name == peer.name
 
     def tell(self, grasp: GraspId, *, slipped: bool) -> tuple[OutcomeStatus, Lift | None]:
-        """Enter an outcome; return its status, and the entry before it (None: no entry)."""
+        """Enter an outcome; return its status, and the lift as it was before (None: not in the
+        book)."""
         lift = self._lifts.get(grasp)
         if lift is None:
             status = OutcomeStatus.UNKNOWN

@@ -24,7 +24,8 @@ from graspd.models.trust.learner import Learner, LearnerState, of_format_2
 from graspd.models.trust.risk import Permission, Risk, RiskLimits, RiskOutcomes, RiskState
 
 VERSION: Final = 3
-"""Format of a state. Format 2 held the result of `Learner.at_told`, format 1 no residual."""
+"""Format of a state. Format 2 held weights and residual as `Learner.at_told` returns them, format
+1 no residual."""
 MAX_BYTES: Final = 1 << 20
 """Largest uncompressed state, bytes; three fingers with no outcome known yet take 620 kB."""
 DIGEST_BYTES: Final = 32
@@ -73,7 +74,7 @@ class Trust:
         inputs: NDArray[np.floating],
         former: Assessment | None,
     ) -> tuple[Assessment, RiskOutcomes]:
-        """Return the assessment of a grasp, and the outcomes known until now.
+        """Return the assessment of a grasp, and what `report` returns.
 
         `opinion`, `inputs`: the network's answer to this reading, and its input features. Without
         an answer the `former` assessment is reviewed. Raises `ValueError` as `judge` does.
@@ -90,8 +91,8 @@ class Trust:
     ) -> Assessment:
         """Return the assessment of a grasp, by the function `assess` of graspd.models.trust.
 
-        `p_slip`, `margin`, `inputs`: answer and inputs of the network. Raises `ValueError` for
-        values that no network gives.
+        `p_slip`, `margin`, `inputs`: probability and log-odds of slip by the network, its inputs.
+        Raises `ValueError` for values that no network gives.
         """
         awaited = self.lifts.awaited
         return assess(self._judging, self.risk, p_slip, margin, inputs, name=grasp, awaited=awaited)
@@ -126,7 +127,7 @@ class Trust:
         return status
 
     def report(self) -> RiskOutcomes:
-        """Return the outcomes of the lifts of `stable` verdicts until now."""
+        """Return how many `stable` lifts there were, held and slipped, and what the risk allows."""
         book = self.lifts
         return self.risk.figures(book.outstanding, book.announced, book.awaited)
 
@@ -151,7 +152,7 @@ class Trust:
         return TrustState(VERSION, self._model, *parts)
 
     def fits(self, state: TrustState) -> bool:
-        """Return True if a state is of this model."""
+        """Return True if a state is of the same model, by its digest."""
         return state.model == self._model
 
     def restore(self, state: TrustState) -> None:
@@ -177,7 +178,7 @@ def encode(state: TrustState) -> bytes:
 
 
 def decode(data: bytes) -> TrustState:
-    """Reverse `encode`. Raises `ValueError` for wrong data, `FormatError` for an old format."""
+    """Reverse `encode`. Raises `ValueError` for wrong data, `FormatError` for an unknown format."""
     digest, content = data[:DIGEST_BYTES], data[DIGEST_BYTES:]
     if len(data) > MAX_BYTES or hashlib.sha256(content).digest() != digest:
         raise ValueError("is damaged, or nothing that was learned")

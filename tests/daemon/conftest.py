@@ -14,7 +14,8 @@ from tests.drivers.twins.signals import untouched_counts
 
 @pytest.fixture(scope="session")
 def untouched(bts3_dir: Path) -> NDArray[np.uint16]:
-    """9.8 s of three untouched sensors at 100 Hz, held values of 71.43 Hz: shape (977, 3, 24)."""
+    """Counts of three untouched sensors, 9.8 s at 100 Hz, where samples of 71.43 Hz repeat: shape
+    (977, 3, 24)."""
     path = bts3_dir.parent / "untouched" / "untouched.csv"
     if not path.is_file():
         pytest.skip("the real recording of an untouched hand is not there")

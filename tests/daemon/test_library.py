@@ -171,12 +171,12 @@ def with_none(values: NDArray[np.float64]) -> list[Any]:
 
 
 def masked(values: NDArray[np.float64]) -> Any:  # noqa: ANN401
-    """Counts, with a plausible one below each mask."""
+    """A masked array of the counts: NaN is masked, with a plausible count below the mask."""
     return np.ma.array(np.nan_to_num(values, nan=3250).astype(np.uint16), mask=np.isnan(values))
 
 
 def columns(values: NDArray[np.float64]) -> dict[str, list[int | None]]:
-    """Columns by name, in another order than the model's fingers."""
+    """Columns of counts by name, in the reverse order of the model's; NaN becomes None."""
     names = [f"{finger}_biotac_{place}" for finger in ("ff", "mf", "th") for place in range(1, 25)]
     rows = values.reshape(len(values), 72).T
     whole = [[None if np.isnan(each) else int(each) for each in row] for row in rows]

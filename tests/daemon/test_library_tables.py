@@ -134,7 +134,7 @@ def test_judge_takes_only_files_and_tables(given: Any, words: str) -> None:  # n
         list(graspd.judge(given))
 
 
-def test_a_session_that_does_not_fit_is_refused(
+def test_a_session_not_needed_or_not_found_is_refused(
     counts: NDArray[np.float64], tmp_path: Path
 ) -> None:
     with pytest.raises(ModelError, match="mlp keeps no session"):

@@ -26,7 +26,7 @@ from graspd.models.trust.risk import Permission, RiskLimits
 from tests.daemon.trust.grasps import INPUTS, inputs, named, trust
 
 BOOK = 6
-"""Most grasps in the book here."""
+"""Most grasps in the book in the random test, so few that some leave it."""
 ALPHAS = st.sampled_from((None, 0.001, 0.05, 0.1, 0.5))
 PEERS = [
     Peer(name, user)
@@ -35,7 +35,7 @@ PEERS = [
 ]
 MARGINS = st.sampled_from((-9.0, -9.0, -4.0, -1.0, 3.0))
 BACK = st.sampled_from((0, 0, 0, 1, 1, 2, 3, 5, 7))
-"""Number of a grasp, counted back from the newest."""
+"""How many grasps before the newest one; some have left the book."""
 
 
 @dataclass
@@ -153,7 +153,7 @@ class Lifts(RuleBasedStateMachine):
 
     @rule(stable=st.booleans(), margin=st.none() | MARGINS)
     def judge_what_cannot_be_assessed(self, stable: bool, margin: float | None) -> None:
-        """Judge a new grasp without features; unless `margin` is None, assess it afterwards."""
+        """Note a grasp, `stable` or not, without features; then judge it by `margin`, if any."""
         stable = stable and self.model.alpha is None
         self.number += 1
         self.part.note(named(self.number), Assessment(0), stable=stable)

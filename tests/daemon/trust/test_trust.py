@@ -140,7 +140,7 @@ def test_a_state_with_a_damaged_byte_is_refused() -> None:
 
 
 def too_many() -> bytes:
-    """A state, without its digest, with one grasp more than the book may have."""
+    """Compressed bytes of a state with one grasp more than the book may have."""
     state = full().state()
     many = tuple(replace(state.lifts.records[0], id=named(n)) for n in range(LIFTS_MAX + 1))
     return encode(replace(state, lifts=replace(state.lifts, records=many)))[DIGEST_BYTES:]
