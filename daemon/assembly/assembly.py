@@ -45,7 +45,10 @@ NO_SILENCE_NS = 3_600_000_000_000
 
 
 def model_path(scene: Scene) -> Path:
-    """Return the model file for the hand's fingers. Raises `ModelError`."""
+    """Return the path of the scene's model; of a named one, the file for the hand's fingers.
+
+    Raises `ModelError` for an unknown name.
+    """
     if scene.model.path is not None:
         return scene.model.path
     name = DEFAULT_MODEL if scene.model.name is None else scene.model.name
@@ -125,7 +128,7 @@ def _refuse_other_fingers(scene: Scene, model: TactileModel) -> None:
 
 
 def _and_sensors(scene: Scene) -> str:
-    """Return advice on `tactile.sensors` if sensors are wired in the order of `hand.fingers`."""
+    """Return advice to write `tactile.sensors`, if a driver with that key lacks it, else ""."""
     match scene.tactile:
         case SpiTactile(sensors=None) | CanTactile(sensors=None):
             return f" and tactile.sensors = {json.dumps(scene.hand.fingers)}, as they are wired"

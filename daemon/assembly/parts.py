@@ -67,7 +67,7 @@ class Parts:
 
 
 class Assembly:
-    """Open the parts of one run and everything around them, one call for each."""
+    """Open drivers, sockets, session, recorder of a run, one call for each, until `stack` ends."""
 
     def __init__(self, parts: Parts, stack: ExitStack) -> None:
         self.companions: list[Companion] = []
@@ -198,7 +198,7 @@ def header_of(plan: Plan, model: TactileModel, boot_id: str) -> RecordingHeader:
 
 
 def header_now(pipeline: Pipeline, header: RecordingHeader) -> Callable[[], RecordingHeader]:
-    """Copy session and learning; return a function that makes the header in any thread."""
+    """Copy session and learning; return a function, for any thread, that adds them to `header`."""
     grasps, session = pipeline.hand.grasp, pipeline.session_then()
     required = {**header.scene["session"], "required": pipeline.needs_session}
     trust = None if pipeline.trust is None else pipeline.trust.state()

@@ -33,7 +33,10 @@ class Plan:
 
     @classmethod
     def of(cls, scene: Scene) -> Plan:
-        """Read the headers of the scene's recordings. Raises `SceneError` or `RecordingError`."""
+        """Return the plan of a scene; read the headers of its recordings, if it has any.
+
+        Raises `SceneError` or `RecordingError`.
+        """
         options, mode, joints = scene.tactile, scene.gate.mode, scene.joints is not None
         if not isinstance(options, ReplayTactile):
             return cls(scene, mode or "settled", joints)
@@ -100,7 +103,7 @@ def recorded_kind(options: ReplayTactile) -> Kind:
 
 
 def require_mcap(what: str) -> None:
-    """Raise `SceneError`, with advice, if a package that `what` needs is not installed."""
+    """Raise `SceneError`, with advice, if the package `mcap`, which `what` needs, is missing."""
     try:
         require("mcap", what, "record")
     except ModuleNotFoundError as error:

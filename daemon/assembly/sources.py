@@ -45,7 +45,7 @@ class Source:
     def scene(self, publish: dict[str, Any], model: dict[str, Any], mode: str | None) -> Scene:
         """Return the scene with the keys `publish` for `[publish]`. Raises `SceneError`.
 
-        `model`: name or path of another model, whose thresholds stay; empty: the same model.
+        `model`: key `name` or `path` of another model; thresholds stay. Empty: the same model.
         `mode`: mode of the gate; None: as recorded.
         """
         former = self._sections.get("model", {})
@@ -69,11 +69,11 @@ class Source:
         """Pass the recorded outcomes to `companion`, if there are any."""
 
     def companions(self) -> list[Companion]:
-        """Return further companions of the replay's loop."""
+        """Return what the replay's loop also calls, such as a count of changed verdicts."""
         return []
 
     def end(self) -> None:
-        """Print how the verdicts differ from recorded ones, for recordings that have any."""
+        """Warn if verdicts differ from recorded ones, for recordings that have any."""
 
 
 class Tables(Source):
@@ -105,7 +105,10 @@ class Tables(Source):
         super().__init__({**sections, **changes}, Path("command line"))
 
     def parts(self, replayed: Scene, model: TactileModel, speed: float | None) -> Parts:
-        """Make the parts for the model's fingers."""
+        """Make driver and judge for a hand of the model's fingers. `speed`: as in the base class.
+
+        Raises `SceneError` if a file lacks a finger, or `RecordingError`.
+        """
         hand = Hand(fingers=model.contract.fingers)
         for path in self._paths:
             if kind_of(path) in BAGS:
@@ -138,7 +141,8 @@ class LinkLogs(Source):
     """Link logs of one kind, in order of time."""
 
     def __init__(self, paths: Sequence[Path], path: Path | None) -> None:
-        """`path`: of the scene; None: defaults. Raises `RecordingError` for two kinds of files."""
+        """`path`: scene file; None: default scene. Raises `RecordingError` for two kinds of files,
+        `SceneError` for a scene with another driver."""
         self._paths = tuple(paths)
         driver = LINK_LOGS[kind_of_all(paths)]
         if path is None:

@@ -179,7 +179,7 @@ def _in_words(bits: ElectrodeFault) -> str:
 
 
 def _names(finger: str, which: Mask) -> str:
-    """Return the names of up to six electrodes, such as `ff_7`, or the number of more."""
+    """Return the names of the electrodes in `which`, such as `ff_7`; over six, their number."""
     numbers = np.flatnonzero(which) + 1
     if len(numbers) > NAMED_MAX:
         return f"{finger}: {len(numbers)} electrodes"

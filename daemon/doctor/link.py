@@ -190,7 +190,10 @@ TROUBLES: dict[LinkCause | DeviceFault, Trouble] = {
 def device_findings(
     driver: str, device: Mapping[str, Fact], counters: Mapping[str, int] | None = None
 ) -> list[Finding]:
-    """Return a finding on each fact of a device; if its link is not up, only the reason."""
+    """Return a finding on each fact of a device; if its link is not up, only the reason.
+
+    `counters`: those of the link, from which the reason is guessed; None: not known.
+    """
     facts = dict(device)
     link = facts.pop("link", None)
     if link is not None and link.fault is not None:

@@ -86,7 +86,10 @@ def explained(finding: Finding, section: DriverSection) -> list[Finding]:
 
 
 def shared_findings(section: DriverSection) -> list[Finding]:
-    """Return a warning if another program has the port open. `explained` says which program."""
+    """Return a warning if another program has the port of `section` open; none for UDP.
+
+    `explained` adds which program.
+    """
     device = section.device
     if device is None or device.kind is DeviceKind.UDP or not computer.file_holders(device.name):
         return []
@@ -95,7 +98,7 @@ def shared_findings(section: DriverSection) -> list[Finding]:
 
 
 def can_finding(interface: computer.CanInterface, tactile: CanTactile | None = None) -> Finding:
-    """Judge a CAN interface; advise how to bring it up for this section of a scene."""
+    """Judge a CAN interface; advise how to bring it up at the bit rate that `tactile` gives."""
     if interface.is_fine:
         return fine(str(interface))
     line = ip_link(interface.name, tactile)

@@ -52,7 +52,7 @@ def test_the_scene_decides_on_learning_and_risk(text: str) -> None:
 
 
 @pytest.mark.parametrize("threshold", [1e-9, 1 - 1e-9])
-def test_slip_threshold_and_max_age_of_the_scene_decide(threshold: float) -> None:
+def test_the_scenes_slip_threshold_and_max_age_decide_the_verdict(threshold: float) -> None:
     scene = scene_of(REPLAY, model={"slip_threshold": threshold}, gate={"max_age_ms": 1.0})
     driver = assembly.build_drivers(Plan.of(scene))[0]
     driver.open()
@@ -68,7 +68,7 @@ def test_slip_threshold_and_max_age_of_the_scene_decide(threshold: float) -> Non
 
 
 def test_a_replayed_table_measures_age_by_the_drivers_clock() -> None:
-    """Now is the driver's `handed_over_ns`; by the computer's clock both readings were stale."""
+    """Now is the driver's `handed_over_ns`; by the computer's clock both would be stale."""
     source = Tables([DEMO_TABLE], {})
     scene = source.scene({}, {}, None)
     parts = source.parts(scene, assembly.load_model(scene), None)
@@ -104,7 +104,7 @@ SOME = [
         ("small-session", ("ff", "rf"), "small-session"),
     ],
 )
-def test_a_hand_with_fewer_fingers_gets_a_fitting_model_file(
+def test_a_hand_with_fewer_fingers_gets_its_model_variant_if_any(
     name: str | None, fingers: tuple[str, ...], file: str
 ) -> None:
     scene = hand(fingers) if name is None else hand(fingers, name=name)
@@ -121,7 +121,7 @@ def test_a_hand_with_fewer_fingers_gets_a_fitting_model_file(
     ],
     ids=["cnn1", "ring finger"],
 )
-def test_a_model_of_other_fingers_is_refused_with_fitting_names(scene: Scene, says: str) -> None:
+def test_a_model_of_other_fingers_is_refused_naming_fitting_models(scene: Scene, says: str) -> None:
     with pytest.raises(ModelError, match=r"judges the fingers .* the hand has ") as refusal:
         assembly.build_pipeline(Plan.of(scene), assembly.load_model(scene))
     assert str(refusal.value).endswith(f": {says}")
@@ -153,7 +153,7 @@ def test_fingers_in_another_order_are_refused_with_working_advice(
 
 
 class Constructed:
-    """Takes a driver's place and keeps the arguments."""
+    """Stands in for a driver's class; keeps its named arguments in `named`."""
 
     def __init__(self, *_positional: object, **named: object) -> None:
         self.named = named

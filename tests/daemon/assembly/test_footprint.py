@@ -88,7 +88,7 @@ FILE = 1
 
 @pytest.fixture(autouse=True)
 def as_everywhere(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let libraries start the same threads everywhere: none per core.
+    """Let libraries start no thread per core, so that every computer counts the same threads.
 
     The telemetry of onnxruntime, on by default from 1.29 on, is off as in CI.
     """
@@ -124,7 +124,7 @@ def test_a_replayed_table_loads_neither_gate_nor_joints(tmp_path: Path) -> None:
     assert len(found["judged"]) == len(found["reading"])
 
 
-def test_replay_loads_no_bus_no_port_no_training() -> None:
+def test_replay_loads_no_modules_for_buses_ports_or_training() -> None:
     code = (
         "import json, sys; from graspd.daemon.__main__ import main; sys.argv[1:] = ['replay']; "
         "main(); sys.stderr.write(json.dumps(sorted(sys.modules)))"

@@ -1,6 +1,6 @@
 """Drivers and twins of every link in one thread and on one clock, as the doctor listens to them.
 
-The hand's own time may pass faster than that of the link: `skip` leaves out those readings.
+The hand's own time may pass faster than the link's: `Hand.skip` leaves out what is not sent.
 """
 
 from __future__ import annotations
