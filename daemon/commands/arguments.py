@@ -34,7 +34,7 @@ class Parser(argparse.ArgumentParser):
         return next((each for each in choices if isinstance(each, Mapping)), {})
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:  # noqa: ANN401
-        """Parse as argparse does, but report an unknown option before a missing argument."""
+        """Parse options and files in any order; report an unknown option first."""
         words: Sequence[str] = sys.argv[1:] if args is None else args
         is_mine = (lambda word: word.startswith("-")) if self.subparsers else lambda _word: True
         for word in takewhile(lambda word: word != "--" and is_mine(word), words):

@@ -75,7 +75,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Examine; 0 if nothing is wrong, 1 if something is. Raises `SceneError` or `DriverError`."""
+    """Examine, print the findings; return 1 if one is an error, else 0.
+
+    Raises `SceneError` or `DriverError`.
+    """
     report: dict[str, Any] = {}
     logging.disable(logging.WARNING)  # findings repeat the warnings of drivers
     try:
@@ -146,7 +149,7 @@ def in_words(findings: Sequence[Finding], columns: int | None) -> Iterator[str]:
 
 
 def _computer(report: dict[str, Any], listen_s: float) -> list[Finding]:
-    """Return findings on the bridges and CAN interfaces of this computer; fill in `report`."""
+    """Return findings on this computer's bridges and CAN interfaces; list all in `report`."""
     ports = [port for port in computer.serial_ports() if port.vendor is not None]
     interfaces = computer.can_interfaces()
     report["ports"] = [dataclasses.asdict(port) for port in ports]
@@ -217,7 +220,7 @@ def _listen(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> lis
 
 
 def _collect(drivers: Sequence[Driver], statistics: ElectrodeStatistics, listen_s: float) -> float:
-    """Feed readings to `statistics` for `listen_s`; return their number times mean period, s."""
+    """Feed readings to `statistics` for `listen_s`; return the time, s, that they cover."""
     start_s = first_s = last_s = time.monotonic()
     while drivers and time.monotonic() - start_s < listen_s and not drivers[0].exhausted:
         poll = select.poll()
@@ -237,7 +240,8 @@ def _collect(drivers: Sequence[Driver], statistics: ElectrodeStatistics, listen_
 
 
 def _with_electrodes(told: list[Finding], statistics: ElectrodeStatistics) -> list[Finding]:
-    """Add findings on electrodes. A fault of the whole device replaces those on absent fingers."""
+    """Return `told`, findings on the device, and those on electrodes. If all fingers are absent and
+    `told` explains it, leave those out; what explains it becomes an error."""
     electrodes = statistics.findings()
     absent = [finding for finding in electrodes if finding.cause is Cause.SENSOR_ABSENT]
     whole = [

@@ -233,7 +233,8 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
 
 
 def _shows_table(args: argparse.Namespace, source: Source, parts: Parts) -> bool:
-    """Return True if a table of two methods is printed: for grasps with outcomes, no `--json`."""
+    """Return True if the table that compares two methods is printed: for grasp tables with
+    outcomes and a model of `ff`, `mf`, `th`, without `--json` and `--verbose`."""
     fingers = parts.model.contract.fingers
     if args.json or args.verbose or not isinstance(source, Tables) or fingers != TABLE_FINGERS:
         return False
@@ -322,7 +323,7 @@ def _parts(args: argparse.Namespace, source: Source) -> Parts:
 def _restore_session(
     args: argparse.Namespace, source: Source, pipeline: Pipeline, fingers: Sequence[str]
 ) -> None:
-    """Restore the session with which a judge begins: the recorded one, or one from a file."""
+    """Restore the session that `--session` names: the recorded one, that of a file, or none."""
     if args.session == RUNNING:
         source.restore(pipeline)
     if args.session in (RUNNING, OFF) or pipeline.session is None:

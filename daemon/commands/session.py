@@ -138,7 +138,7 @@ def _readable(found: Found) -> dict[int, KeptSession]:
 def _continued(
     wanted: scene.Scene, model: TactileModel, sessions: dict[int, KeptSession]
 ) -> tuple[dict[int, KeptSession], bool]:
-    """Return the sessions, first what a start continues; True if that start is calibrated."""
+    """Return the sessions, first the one that a start continues; True if it is then calibrated."""
     pipeline = assembly.build_pipeline(Plan.of(wanted), model)
     fingers, kept = tuple(wanted.hand.fingers), list(sessions.values())
     used, learned, problems = continue_kept(pipeline, fingers, newest_of_each(kept))
@@ -189,7 +189,7 @@ def _when(kept: KeptSession) -> str:
 
 
 def _learned(state: TrustState | None) -> dict[str, Any] | None:
-    """Return figures of what was learned from outcomes; None: nothing was."""
+    """Return model, risk, numbers of outcomes and lifts of a state as JSON; None: no state."""
     if state is None:
         return None
     return {
@@ -206,7 +206,7 @@ def _learned(state: TrustState | None) -> dict[str, Any] | None:
 
 
 def _seed(wanted: scene.Scene, model: TactileModel, played: scene_drivers.ReplayTactile) -> None:
-    """Judge recordings, learn from their outcomes, keep the session. Raises `DriverError`."""
+    """Judge `played` recordings, learn from outcomes, keep the session. Raises `DriverError`."""
     mode: GateMode | None = "every" if kind_of_all(played.recordings) is Kind.MCAP else None
     plan = Plan.of(_on_recordings(wanted, played, mode))
     pipeline = assembly.build_pipeline(plan, model)
@@ -326,7 +326,7 @@ def _rest(
 
 
 def _check(plan: Plan, model: TactileModel, state: SessionState) -> None:
-    """Raise `DriverError` if most recorded grasps are `never-seen` under the new session."""
+    """Raise `DriverError` if most judged readings are `never-seen` with the new session `state`."""
     pipeline = assembly.build_pipeline(plan, model, learns=False)
     if pipeline.session is not None:
         pipeline.session.restore(state)
@@ -343,7 +343,7 @@ def _check(plan: Plan, model: TactileModel, state: SessionState) -> None:
 def _on_recordings(
     wanted: scene.Scene, recordings: scene_drivers.ReplayTactile, mode: GateMode | None
 ) -> scene.Scene:
-    """Return the scene with recordings for sensors, `mode` of the gate, and no `[risk]`."""
+    """Return the scene with recordings for sensors, gate `mode`, no joints, age limit or risk."""
     max_age_ms = assembly.NO_SILENCE_NS / 1e6  # a recorded reading is never late
     gate = wanted.gate.model_copy(update={"mode": mode, "max_age_ms": max_age_ms})
     changes = {"tactile": recordings, "joints": None, "gate": gate, "risk": None}
@@ -351,7 +351,7 @@ def _on_recordings(
 
 
 def _judge(plan: Plan, pipeline: Pipeline, unjudged: Unjudged) -> list[Judgement]:
-    """Return the judgement of each recorded grasp; report each known outcome after it."""
+    """Return the judgements of readings that the gate passed; report known outcomes after each."""
     judgements: list[Judgement] = []
     for reading in _readings(plan):
         unjudged.on_reading(reading)

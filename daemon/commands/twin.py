@@ -157,7 +157,7 @@ def _add_faults(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Serve until stopped or the recording ends; print injected faults as JSON. Return 0, or 2."""
+    """Serve until stopped or the recording ends; print injected faults as JSON. 2: an error."""
     stop = threading.Event()
     former = {number: signal.signal(number, lambda *_: stop.set()) for number in stopping()}
     try:

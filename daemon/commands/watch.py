@@ -117,7 +117,10 @@ def _hand(
     scene_path: Path | None = None,
     name: str | None = None,
 ) -> HandFeed:
-    """Connect to one daemon. Raises `UsageError` or `KeysError`."""
+    """Connect to one daemon. Raises `UsageError` or `KeysError`.
+
+    `server_key`: its public key, needed with `--keys`. `name`: of the hand; None: not known.
+    """
     keys = None
     if args.keys is not None:
         if server_key is None:
@@ -131,7 +134,10 @@ def _hand(
 
 
 def where_to_look(endpoint: str, scene_path: Path | None = None) -> tuple[str, str]:
-    """Return the commands that show why the daemon of an endpoint is silent or has no readings."""
+    """Return advice for two cases: the daemon of an endpoint is silent, or has no readings.
+
+    `scene_path` None: the service's scene, if the endpoint is in its folder of sockets.
+    """
     socket, where = Path(endpoint.removeprefix("ipc://")), ""
     if scene_path is None and socket.parent == SOCKETS:
         scene_path = SCENES / f"{socket.stem}.toml"

@@ -28,7 +28,7 @@ def test_a_model_without_a_card_is_shown_by_its_contract(own: Path) -> None:
     )
 
 
-def test_a_file_that_the_daemon_would_refuse_is_not_shown(own: Path) -> None:
+def test_models_refuses_a_damaged_model_or_a_wrong_card(own: Path) -> None:
     whole, card = own.read_bytes(), zoo.card("mlp")
     for content, described, says in (
         (whole[:-100], None, "not a usable ONNX model"),

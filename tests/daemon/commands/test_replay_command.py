@@ -35,7 +35,7 @@ DEMO_LINE = re.compile(
 )
 
 
-def test_the_demo_compares_both_methods_on_a_day_of_drift() -> None:
+def test_the_demo_compares_graspd_with_the_published_network_on_drifting_sensors() -> None:
     demo, program = graspd("replay"), graspd("replay", "--json")
     assert demo.returncode == program.returncode == 0, demo.stderr
     text = demo.stdout
@@ -64,7 +64,7 @@ def test_the_demo_compares_both_methods_on_a_day_of_drift() -> None:
     assert f"unknown, grasp again   {unknown} of 300, published 0" in text
 
 
-def test_the_demos_published_method_is_its_network_alone() -> None:
+def test_the_demos_published_method_is_the_network_cnn1_alone() -> None:
     model, rows = TactileModel(zoo.find("cnn1")), list(read_rows(DEMO_DAY, ("ff", "mf", "th")))
     stable = []
     for row in rows:
@@ -182,7 +182,7 @@ def test_a_subscriber_in_another_process_gets_every_paced_verdict(
     assert list(tmp_path.iterdir()) == [received]
 
 
-def test_replay_fails_without_a_subscriber(tmp_path: Path) -> None:
+def test_replay_with_wait_fails_without_a_subscriber(tmp_path: Path) -> None:
     result = graspd("replay", "--publish", f"ipc://{tmp_path}/graspd", "--wait", 0.1)
     assert result.returncode == 1
     assert result.stderr.startswith("graspd: no subscriber of ipc://")

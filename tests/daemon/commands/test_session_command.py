@@ -70,7 +70,7 @@ def test_an_unusable_session_is_not_shown_as_calibrated(tmp_path: Path) -> None:
     assert shown[1][1] == ""
 
 
-def test_garbage_seeds_no_session(scene: Path, tmp_path: Path) -> None:
+def test_random_counts_seed_no_session(scene: Path, tmp_path: Path) -> None:
     random = np.random.default_rng(0)
     header = [f"{finger}_biotac_{n}" for finger in ("ff", "mf", "th") for n in range(1, 25)]
     rows = [",".join(map(str, row)) for row in random.integers(1, 4095, (200, 72)).tolist()]

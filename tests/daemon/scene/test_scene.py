@@ -193,7 +193,7 @@ def test_every_section_of_the_scene_forbids_unknown_keys() -> None:
         ("tcp://127.0.0.1:5555", "ipc://{}/a", False),
     ],
 )
-def test_equal_endpoints_are_refused_however_written(
+def test_publish_and_ask_endpoints_that_clash_are_refused_however_written(
     first: str | None, second: str | None, clash: bool, tmp_path: Path
 ) -> None:
     (tmp_path / "link").symlink_to(tmp_path)
