@@ -190,7 +190,7 @@ class LiftBook:
         return True
 
     def announce(self) -> None:
-        """Note that a `lift` question about the newest grasp was answered `stable`."""
+        """Note, once, that a `lift` question about the newest grasp was answered `stable`."""
         lift = next(reversed(self._lifts.values()), None)
         if lift is None or not lift.stable or lift.announced or lift.slipped is not None:
             return

@@ -104,7 +104,7 @@ SOME = [
         ("small-session", ("ff", "rf"), "small-session"),
     ],
 )
-def test_a_hand_with_fewer_fingers_gets_its_model_variant_if_any(
+def test_fewer_fingers_get_the_models_variant_for_them_if_any(
     name: str | None, fingers: tuple[str, ...], file: str
 ) -> None:
     scene = hand(fingers) if name is None else hand(fingers, name=name)

@@ -35,7 +35,7 @@ DEMO_LINE = re.compile(
 )
 
 
-def test_the_demo_compares_graspd_with_the_published_network_on_drifting_sensors() -> None:
+def test_the_demo_compares_graspd_with_the_published_network_under_drift() -> None:
     demo, program = graspd("replay"), graspd("replay", "--json")
     assert demo.returncode == program.returncode == 0, demo.stderr
     text = demo.stdout
