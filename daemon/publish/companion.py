@@ -1,4 +1,4 @@
-"""Companions of the loop: sockets, session keeper, recorder, printer, realtime mode, systemd."""
+"""Base class of the loop's companions, such as sockets or recorder; what they get and call."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class Requests(Protocol):
         """Request a judgement for a controller that decides whether to lift."""
 
     def silence(self) -> None:
-        """Publish that no reading has come."""
+        """Publish an `unknown` verdict, as no reading has come."""
 
     def outcome(self, report: Report, answer: Answer) -> None:
         """Report the outcome of a lift; `answer` is called once it is on the disk, or refused."""
@@ -132,7 +132,7 @@ class Companion:
 
     @property
     def health(self) -> dict[str, Reason]:
-        """Parts that are not well, and why, for the status."""
+        """Current problems, for the status: the reason by part, such as `publish`; {}: none."""
         return {}
 
 

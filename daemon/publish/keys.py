@@ -117,7 +117,7 @@ class Admission:
     """Peers that may connect to `tcp://` sockets."""
 
     folder: Path
-    """Folder of their public keys."""
+    """Folder of the public keys of these peers."""
     admitted: Mapping[bytes, str] = field(default_factory=dict)
     """Name of each peer, by its public key, Z85."""
     seen: object = None

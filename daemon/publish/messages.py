@@ -291,14 +291,14 @@ MESSAGES: Final[dict[str, type[Message]]] = {
     "outcome": OutcomeMessage,
     "status": Status,
 }
-"""Messages by the first part of their topic."""
+"""Type of each message, by the first part of its topic."""
 
 encode = msgspec.json.Encoder().encode
 """Return the JSON payload of a message."""
 
 
 def withheld(verdict: Verdict, reason: Reason) -> bytes:
-    """Return the JSON of a verdict, changed to `unknown` for this reason, without leave to lift."""
+    """Return the JSON of a verdict, changed to `unknown` for this reason, and not `supervised`."""
     unsure = replace(verdict, verdict=Decision.UNKNOWN, verdict_code=0, reasons=[reason])
     without = replace(unsure, p_slip=None, p_slip_model=None, valid=False, judged=False)
     return encode(replace(without, supervised=False, early=False))

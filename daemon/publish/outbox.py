@@ -93,7 +93,8 @@ class Deadlines:
     def add(self, reading: TactileReading, age_ms: float, period_ns: int | None) -> None:
         """Count a reading whose verdict came `age_ms` after its last byte.
 
-        `period_ns`: time between two readings of the sensor, ns; None: not known.
+        `period_ns`: time between two readings of the sensor, ns; None: not known, and neither late
+        verdicts nor jitter are counted.
         """
         if age_ms > self.worst_age_ms:
             self.worst_age_ms = age_ms
@@ -252,7 +253,7 @@ class Outbox:
             output.send(topic, payload)
 
     def _head(self, kind: str) -> dict[str, Any]:
-        """Return the fields that begin each message."""
+        """Return a message's `boot_id`, the next `seq` of its kind, and the wall-clock time `t`."""
         seq = self._sent[kind]
         self._sent[kind] += 1
         return {"boot_id": self.boot_id, "seq": seq, "t": self._wall_clock()}
@@ -289,7 +290,7 @@ class Outbox:
         """Send and return one status.
 
         `drivers`: counters of drivers and companions, by part. `beside`: current problems of
-        companions, by part.
+        companions, by part; `pipeline` tells its own.
         """
         session, hand, trust = pipeline.session, pipeline.hand, pipeline.trust
         deadlines = self._deadlines

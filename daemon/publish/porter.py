@@ -58,13 +58,13 @@ Without a limit two peers fill 100 MiB a second, faster than Python reads."""
 QUESTIONS_MAX: Final = 8
 """Most questions that the loop takes in one round: 0.3 ms on a slow computer."""
 PAUSE_MS: Final = 2
-"""Pause of the courier after `QUESTIONS_MAX` questions, ms."""
+"""Longest pause of the courier after up to `QUESTIONS_MAX` questions, ms; an answer ends it."""
 FRAMES_MAX: Final = 4
 """Most frames kept of a message: routing id, delimiter, text, and one that marks it as wrong."""
 LINGER_MS: Final = 500
 """Longest wait at closing for peers to take queued messages, ms."""
 CLOSE_S: Final = 1
-"""Longest wait at closing for libzmq's threads, s; the watchdog waits 2 s."""
+"""Longest wait of `Door.close` for this process to end, s; systemd's watchdog waits 2 s."""
 LOOK_MS: Final = 1000
 """Time between two checks of threads and keys, ms."""
 MEMORY_MAX_BYTES: Final = 512 << 20
@@ -114,7 +114,7 @@ class Proxy(threading.Thread):
     """Copies messages between two sockets until their context ends, then closes the sockets."""
 
     def __init__(self, endpoint: str, front: Socket, back: Socket) -> None:
-        """`front`, `back`: sockets that only this thread may use after `start`."""
+        """`endpoint`: for the log. `front`, `back`: only this thread uses them after `start`."""
         super().__init__(name=f"serve {endpoint}", daemon=True)
         self.endpoint = endpoint
         self._front, self._back = front, back
@@ -180,7 +180,7 @@ class Courier(Proxy):
         return True
 
     def _credential(self, frame: zmq.Frame) -> bytes:
-        """Return `user <uid>` as the kernel says, `key <name>` by the handshake, or b""."""
+        """Return the sender: `user <uid>` by the kernel, `key <name>` by the handshake, or b""."""
         with suppress(zmq.ZMQError):  # libzmq knows nothing of the sender
             if self.endpoint.startswith("ipc://"):
                 _, *numbers = str(frame.get("Peer-Address")).rsplit(":", 3)  # uid, gid, pid
@@ -291,7 +291,7 @@ class Porter:
         return made
 
     def _watch(self, made: Socket, number: int, events: int = 0) -> None:
-        """Monitor `events` of a socket. Call it before a peer of endpoint `number` can connect."""
+        """Monitor `events` (with keys, also failed handshakes). Call this before peers connect."""
         if self._keys_at(number) is not None:
             events |= FAILED
         if events:

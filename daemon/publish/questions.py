@@ -128,7 +128,7 @@ class Questions:
         self.waiting[peer] = question
 
     def _give_up(self, peer: Peer, reason: Reason) -> None:
-        """Answer a question with `unknown`; before the first verdict only drop it."""
+        """Answer the peer's question `unknown`, for `reason`; before any verdict only drop it."""
         question = self.waiting.pop(peer)
         self._withdraw(peer, question)
         self.counters["given_up"] += 1
@@ -204,7 +204,7 @@ class Questions:
                     self._answer(question.envelope, payload)
 
     def _payload(self, peer: Peer, question: Question, published: PublishedVerdict) -> bytes | None:
-        """Return the answer to a question; None: its offer is not on the disk yet."""
+        """Offer the grasp if it may be lifted; return the answer; None: the disk has to reply."""
         verdict, lifts = published.verdict, published.lifts
         is_stable = verdict.verdict is Decision.STABLE
         is_offer = question.lifts and (is_stable or verdict.supervised)

@@ -62,7 +62,7 @@ TACTILE = b"tactile."
 HIGH_WATER_MARK = 10
 """Most messages that wait for a subscriber: a tenth of a second of verdicts at 100 Hz."""
 NEVER_NS = 10**18
-"""Period of readings that are never sent, ns: thirty years."""
+"""Longest period of published readings, ns: thirty years, so practically never."""
 
 
 class Sockets(Companion):
@@ -126,7 +126,7 @@ class Sockets(Companion):
             self._counters["dropped"] += 1
 
     def wanted(self, topic: bytes) -> bool:
-        """Return True if a message of this topic is due; readings are sent at `tactile_hz`."""
+        """Return True if this topic is due; for readings only once per period (`tactile_hz`)."""
         if not topic.startswith(TACTILE):
             return True
         if self._tactile_period_ns is None:
@@ -142,7 +142,7 @@ class Sockets(Companion):
         return self._door is not None and self._door.answer(frames)
 
     def before_wait(self, requests: Requests) -> int | None:
-        """Take and answer questions; return when the next answer is due, monotonic ns."""
+        """Restart an ended process; serve questions. Return when one is due, ns, or None."""
         if self._door is None:
             return None
         self._door.check()
@@ -239,7 +239,7 @@ class Door:
             raise
 
     def _socket(self, kind: int, name: str, sent: int = 1, received: int = 1) -> Socket:
-        """Return a socket to the process; `sent`, `received`: most messages that it queues."""
+        """Return a socket to the process's `name`; `sent`, `received`: most messages it queues."""
         made = self._context.socket(kind)
         made.linger = 0
         made.sndhwm, made.rcvhwm = sent, received
