@@ -42,7 +42,7 @@ class Export:
     without_outcome: int = 0
     """Judged grasps without an outcome."""
     repaired: int = 0
-    """Grasps judged with repaired electrodes."""
+    """Grasps with an outcome, but judged with repaired electrodes."""
     repeated: int = 0
     """Grasps with the same counts as an earlier one, such as from a replay in a loop."""
     unjoined: int = 0
@@ -113,7 +113,7 @@ def collect(paths: Sequence[Path]) -> Export:
 
 
 def write(out: TextIO, export: Export, object_name: str) -> None:
-    """Write the table, one row per grasp. `object_name`: for grasps without one."""
+    """Write the table as CSV, one row per grasp. `object_name`: for grasps without one."""
     writer = csv.writer(out, lineterminator="\n")
     names = [name for finger in export.fingers for name in electrode_columns(finger)]
     writer.writerow([OBJECT, SLIPPED, *names])

@@ -1,4 +1,4 @@
-"""Collect bytes and frames of a link for a link log."""
+"""Collect CAN frames, or bytes of a serial line, for a log beside the recording."""
 
 from __future__ import annotations
 

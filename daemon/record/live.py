@@ -44,7 +44,7 @@ class LiveServer:
         return int(self._server.port)
 
     def send(self, topic: bytes, payload: bytes) -> None:
-        """Pass on a published message; ignore one of an unknown topic, or malformed."""
+        """Pass on a message, its log lines and image; ignore an unknown topic or malformed JSON."""
         kind, _, hand = topic.decode(errors="replace").partition(".")
         if kind not in schemas():
             return

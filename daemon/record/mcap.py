@@ -165,7 +165,7 @@ class McapWriter(RecordingFile):
 def make_room(options: Record, hand: str) -> int:
     """Delete the hand's oldest recordings until another file fits; return their number.
 
-    A link log belongs to its recording. Raises `OSError`.
+    The link log of a recording is deleted with it. Raises `OSError`.
     """
     options.folder.mkdir(parents=True, exist_ok=True)
     recordings = _recordings(options.folder, hand)

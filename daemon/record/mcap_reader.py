@@ -65,7 +65,7 @@ class RecordedMessage(NamedTuple):
     kind: str
     """First part of the topic: a value of `Topic`, or unknown."""
     at_ns: int
-    """Monotonic time of the recording daemon, ns."""
+    """Time when it was recorded, on the monotonic clock of the recording daemon, ns."""
     payload: bytes
     """Content, JSON."""
 
@@ -139,7 +139,7 @@ class _Content:
 
 
 class McapReader:
-    """Reader of one file: the constructor reads the header, iterating the messages. Iterate once.
+    """Reader of one file: `header` is read at once; iterate over the reader once for messages.
 
     Messages come in the order of their log time; those of one time in the order of the file. The
     iteration ends where the file is damaged. It raises `RecordingError` if the file unpacks to
@@ -270,7 +270,7 @@ class McapReader:
             self._damage = error
 
     def _open(self, part: _Part, opened: list[tuple[int, int, _Content]]) -> None:
-        """Unpack a part, and add it to the heap of those that are being read."""
+        """Unpack a part onto the heap `opened`. Raises `RecordingError` if too much is open."""
         content = _Content(self._unpacked(part), self._kinds)
         if content.next_ns is not None:
             heapq.heappush(opened, (content.next_ns, part.place, content))

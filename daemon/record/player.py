@@ -35,9 +35,9 @@ RecordedEvent = Topic | OutcomeMessage | Exchanged | Late | GateMessage | Said
 about the next reading: it was late, it changed the gate, or its verdict."""
 _Item = Reading | RecordedEvent
 LATE = b'{"judged":false}'
-"""Mark of a reading that may have been late."""
+"""Content of the `late` message played before a reading that may have been late."""
 STALE = f'"{Reason.STALE}"'.encode()
-"""Part of the verdict on a late reading."""
+"""Text in the JSON of a verdict on a late reading."""
 HELD_MAX = 64
 """Most messages that may stand between a reading and the messages about it."""
 

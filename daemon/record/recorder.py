@@ -178,7 +178,7 @@ class Recorder(Companion):
             self._last_topic = topic
 
     def _goes_on(self) -> bool:
-        """Return True, after noting drops, if the queue has room; else count a drop."""
+        """Return True, after queueing `dropped`, if there is room again; else count a drop."""
         if len(self._queue) >= QUEUE_MAX:
             self._dropped += 1
             self._room = 0
@@ -189,7 +189,8 @@ class Recorder(Companion):
 
     @property
     def counters(self) -> dict[str, dict[str, int]]:
-        """Number of entries recorded, dropped (slow disk) and lost (failed disk), and of files."""
+        """Under `record`: entries `recorded`, `dropped` (slow disk), `lost` (failed disk); `files`
+        begun and `removed`; `failures` of the disk; `writing`, 1 while files are open."""
         writing = int(self._open is not None)
         return {"record": {**self._counted, "dropped": self._dropped, "writing": writing}}
 
@@ -215,7 +216,7 @@ class Recorder(Companion):
             self._finish()
 
     def go_round(self) -> None:
-        """Write the queue; after a failure drop it until the next try is due."""
+        """Write queued entries, flush if due; while no file is open, count the entries as lost."""
         entries = [self._queue.popleft() for _ in range(len(self._queue))]
         self._taken.set()
         now_ns = self._clock()
@@ -313,7 +314,7 @@ class Recorder(Companion):
         self._counted["recorded"] += current.unflushed
 
     def _fail(self, error: OSError) -> None:
-        """Count a failure of the disk, warn once, and schedule the next try."""
+        """Close the files after a failure of the disk; count it, warn once, schedule a retry."""
         current, self._open = self._open, None
         self._number += 1  # the next file does not follow the last one
         if current is not None:

@@ -64,7 +64,7 @@ class Judged(msgspec.Struct, frozen=True, kw_only=True):
     v: Literal[1] = WIRE_VERSION
     boot_id: str
     t_mono_ns: Count
-    """Monotonic time of the verdict, ns."""
+    """`t_mono_ns` of the verdict: time of the reading's last byte, ns."""
     grasp: Count
     """Number of the verdict's grasp. The last message on a grasp counts."""
     counts: list[list[Count]]
@@ -150,7 +150,8 @@ MESSAGES: Final[dict[str, type[msgspec.Struct]]] = {
 """Type of the messages by the first part of their topic."""
 EVENTS: Final = (Topic.ASKED, Topic.SKIPPED, Topic.ANNOUNCED, Topic.TAKEN_BACK)
 PLAYED: Final = (*EVENTS, Topic.TACTILE, Topic.JOINTS, Topic.OUTCOME, Topic.EXCHANGED)
-"""Topics whose messages a replay plays."""
+"""Topics that a replay plays in their order; it plays `late`, `gate` and `verdict` before their
+reading, and `dropped` as `skipped`."""
 EVENT: Final = b"{}"
 
 decode_exchanged = msgspec.json.Decoder(Exchanged).decode
@@ -228,7 +229,7 @@ def _part(name: str, value: object) -> object:
 
 
 def table(values: object) -> object:
-    """Return recorded counts, row by row, as rows of 24, one per finger."""
+    """Return a flat list of counts as rows of 24, one per finger; other values as they are."""
     if not isinstance(values, list):
         return values
     return [values[first : first + ELECTRODES] for first in range(0, len(values), ELECTRODES)]

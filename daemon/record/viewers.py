@@ -37,7 +37,7 @@ _COLOURS: Final = {
     80: (251, 180, 26),
     100: (252, 255, 190),
 }
-"""Colour by level: blue is risen, yellow is pressed most."""
+"""Colour (RGB) by level, -100..100: blue is risen, yellow is pressed most."""
 _PALETTE = np.array(
     [
         np.interp(np.arange(-FULL, FULL + 1), list(_COLOURS), channel)
@@ -167,7 +167,7 @@ class Viewer:
         self._state, self._health = message.state, message.health
 
     def _image_if_due(self, message: Message, wall_ns: int) -> RawImage | None:
-        """Return the image of a reading if one is due. Raises `ValueError`."""
+        """Return the image of a `tactile` message if one is due, else None. Raises `ValueError`."""
         if not isinstance(message, Tactile):
             return None
         late_ns = wall_ns - self._due_ns
@@ -200,7 +200,7 @@ class Viewer:
     def _finger(
         self, name: str, counts: NDArray[np.float64], sound: NDArray[np.bool_]
     ) -> NDArray[np.uint8]:
-        """Draw one finger, shape (`HEIGHT`, `WIDTH`, 3)."""
+        """Return a finger's picture, shape (`HEIGHT`, `WIDTH`, 3); while idle, learn its rest."""
         if self._gate is GateState.IDLE:
             self._rest.learn(name, counts, sound)
         rest = self._rest.of(name)
