@@ -147,7 +147,8 @@ def take(lifts: LiftBook, report: Report) -> bool:
 
 
 def plain(payload: bytes) -> object:
-    """Return the part of an answer that `Model` predicts."""
+    """Return what `Model` predicts of an answer: `ok` of an outcome; `said` or (verdict, owner,
+    supervised) of a verdict; (verdict, reasons) if it is `unknown` without an owner."""
     found: dict[str, Any] = json.loads(payload)
     if "ok" in found:
         return found["ok"]

@@ -114,7 +114,7 @@ def test_a_slow_subscriber_loses_messages_but_not_their_order(tmp_path: Path, pe
     assert numbers == sorted(set(numbers))
 
 
-def test_all_messages_before_the_last_status_arrive(tmp_path: Path, peers: Peers) -> None:
+def test_closing_after_a_status_loses_no_message_sent_before(tmp_path: Path, peers: Peers) -> None:
     endpoint = f"ipc://{tmp_path}/v"
     with Publisher(endpoint) as publisher:
         subscriber = peers.subscribe(endpoint)
@@ -200,7 +200,7 @@ def test_peers_reconnect_after_the_socket_process_was_killed(
         os.kill(process, signal.SIGKILL)
 
 
-def test_the_socket_process_cleans_up_and_ends_with_the_daemon(tmp_path: Path) -> None:
+def test_a_killed_daemons_socket_process_ends_and_removes_its_folder(tmp_path: Path) -> None:
     code = (
         "import os, sys; from graspd.daemon.publish.sockets import Door;"
         "from graspd.daemon.publish.listener import Listener;"

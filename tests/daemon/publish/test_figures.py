@@ -108,7 +108,7 @@ def test_scores_that_cannot_be_computed_are_left_out(
     assert any("recorded" in line for line in summary.lines(1.0, None)) is (scores is not None)
 
 
-def test_figures_of_stable_verdicts_match_a_count_by_hand() -> None:
+def test_coverage_and_shares_of_slips_match_a_count_by_hand() -> None:
     tally = Tally()
     cases = [
         (Decision.STABLE, False, 60),

@@ -54,7 +54,7 @@ def test_a_foreign_file_at_the_path_is_refused_and_kept(
 
 
 @pytest.mark.parametrize("kind", [socket.SOCK_STREAM, socket.SOCK_DGRAM, socket.SOCK_SEQPACKET])
-def test_a_socket_with_a_listener_is_kept(tmp_path: Path, kind: int) -> None:
+def test_the_socket_of_a_running_program_is_refused_and_kept(tmp_path: Path, kind: int) -> None:
     path = tmp_path / "v"
     with socket.socket(socket.AF_UNIX, kind) as theirs:
         theirs.bind(str(path))

@@ -62,8 +62,8 @@ def is_valid(verdict: Verdict) -> bool:
 def until_unknown(subscriber: Subscriber, deed: Callable[[], object], reason: Reason) -> int:
     """Call `deed` while verdicts are valid, and wait until one is unknown for this reason.
 
-    Return how many readings after it were judged. A busy computer that stands still makes verdicts
-    unknown for another reason.
+    Return how many readings made after `deed` were judged. A busy computer that stands still makes
+    verdicts unknown for another reason.
     """
     subscriber.drain()
     subscriber.wait_for(is_valid)

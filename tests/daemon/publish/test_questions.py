@@ -73,7 +73,10 @@ class Asked:
         return True
 
     def tell(self, peer: bytes, *frames: bytes, requests: Requests | None = None) -> dict[str, Any]:
-        """Report an outcome by `frames`, which is not counted as a question; return the answer."""
+        """Report an outcome by `frames`; return the answer.
+
+        `requests`: stand-in for the loop; None: one that takes only outcomes of grasp 7.
+        """
         requests = requests or Requests(takes_the_seventh)
         self.questions.take([[peer, USER, *frames]], 0, requests)
         assert requests.times == 0
@@ -137,7 +140,7 @@ def test_a_question_due_before_the_first_reading_publishes_silence(
 SLIP, STABLE = (f"outcome {BOOT} 7 {how}".encode() for how in ("slip", "stable"))
 
 
-def test_an_outcome_is_answered_at_once(asked: Asked) -> None:
+def test_a_taken_or_refused_outcome_is_answered_and_counted(asked: Asked) -> None:
     assert asked.tell(TELLER, STABLE) == {"v": 1, "ok": True}
     assert asked.tell(TELLER, b"", STABLE) == {"v": 1, "ok": True}
     refused = asked.tell(TELLER, f"outcome {BOOT} 8 slip".encode())

@@ -158,7 +158,9 @@ def junk(rng: random.Random) -> list[bytes]:
 
 
 @pytest.mark.parametrize(("door", "kind"), [("v", zmq.XSUB), ("ask", zmq.DEALER)])
-def test_hostile_messages_do_no_harm(tmp_path: Path, peers: Peers, door: str, kind: int) -> None:
+def test_after_hostile_messages_other_peers_are_still_served(
+    tmp_path: Path, peers: Peers, door: str, kind: int
+) -> None:
     rng, requests = random.Random(1), Asked()
     with Sockets(scene_of(tmp_path)) as sockets:
         questions = sockets.questions

@@ -107,7 +107,7 @@ def test_a_malformed_verdict_fails_decoding_and_schema_validation(change: dict[s
 
 def fields_of(page: str, heading: str) -> set[str]:
     """Return the names in backticks before the colons of a section's list, and in its lines that
-    begin with one."""
+    begin with a backtick."""
     section = page.partition(f"{heading}\n")[2].partition("\n## ")[0]
     heads = re.findall(r"^- (`[^:]*`):|^(`.*)$", section, re.MULTILINE)
     return {name for head in heads for name in re.findall(r"`(\w+)`", "".join(head))}
