@@ -209,7 +209,7 @@ def test_an_outcome_reported_after_a_restart_finds_its_grasp(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("counts", [[[1] * 24] * 2, [[1] * 23] * 3, [[70_000] * 24] * 3, []])
-def test_counts_of_another_shape_or_size_are_refused(
+def test_counts_of_wrong_shape_or_beyond_16_bits_are_refused(
     tmp_path: Path, counts: list[list[int]]
 ) -> None:
     record(tmp_path / "a.mcap", (np.array(counts), "slip", None))

@@ -68,7 +68,7 @@ def test_a_stream_is_not_judged_as_grasps_by_the_library() -> None:
 @pytest.mark.parametrize(
     "words", [["replay"], ["session", "seed", "scene.toml"], ["train", "svm", "--own"]]
 )
-def test_no_command_takes_sweeps_without_times_for_grasps(
+def test_no_command_reads_sweeps_without_times_as_grasps(
     tmp_path: Path, words: Sequence[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if words[0] == "train":

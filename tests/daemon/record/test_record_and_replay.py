@@ -130,7 +130,7 @@ def test_a_run_on_a_slow_computer_replays_bit_for_bit(rotated: Lab) -> None:
 def filtered(source: Path, path: Path, *, metadata: bool = True, every: int = 1) -> Path:
     """Write a recording again as another tool does, and return its path.
 
-    `every`: only readings whose number is a multiple of it are kept.
+    `metadata`: copy it too. `every`: keep only readings whose number is a multiple of it.
     """
     with source.open("rb") as stream, path.open("wb") as target:
         writer, reader = Writer(target), make_reader(stream)
@@ -193,7 +193,7 @@ def test_the_summary_of_a_replay_counts_recorded_outcomes(rotated: Lab) -> None:
     assert graspd("replay", "--outcomes", *rotated.files).returncode == 2
 
 
-def test_a_recording_is_not_replayed_with_gate_every(rotated: Lab) -> None:
+def test_replaying_a_recording_with_gate_every_is_refused(rotated: Lab) -> None:
     result = graspd("replay", *rotated.files, "--gate", "every")
     assert (result.returncode, result.stdout) == (2, "")
     assert "gate mode `every` judges each row of a grasp table" in result.stderr

@@ -116,7 +116,7 @@ def test_the_oldest_files_make_room_and_nothing_else_is_removed(
     assert all(path.exists() for path in [*paths[2:], *strangers])
 
 
-def test_all_files_together_keep_within_their_size(tmp_path: Path) -> None:
+def test_old_files_are_deleted_until_all_fit_in_keep_mb(tmp_path: Path) -> None:
     for hour in range(5):
         old(tmp_path, hour, 10**6)
     for keep_mb, removed in ((4.5, 2), (1.0, 3), (1.0, 0)):

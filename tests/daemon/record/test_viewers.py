@@ -63,7 +63,7 @@ def test_a_viewer_can_read_the_schema_of_every_topic(topic: Topic) -> None:
     assert list(faults(schema, topic)) == []
 
 
-def test_an_unknown_finger_is_recorded_as_unknown() -> None:
+def test_a_null_finger_state_is_recorded_as_unknown() -> None:
     told = {"fingers": {"ff": "slide", "mf": None}, "motion": {"ff": None}, "p_slip": None}
     assert flat(told) == {"fingers": {"ff": "slide", "mf": "unknown"}, "motion": {}}
     fields = json.loads(schemas()[Topic.VERDICT][1])["properties"]["fingers"]["properties"]
