@@ -28,7 +28,7 @@ class DayTable(Companion):
     ) -> None:
         """`published`: network that judges each grasp without session, outcomes or refusal.
 
-        `model`: name of graspd's model. `title`, `warnings`: lines to write above the figures.
+        `model`: name of graspd's model. `title`, `warnings`: lines to write above the table.
         """
         self._published = GraspJudge.of(published)
         self._part = Tally(), Tally()
@@ -67,7 +67,7 @@ class DayTable(Companion):
         self._part = Tally(), Tally()
 
     def summary(self, trust: Trust | None) -> None:
-        """Write the totals. `trust`: what outcomes taught; None: the run does not learn."""
+        """Write the totals, and what outcomes taught. `trust`: None: the run does not learn."""
         report = None if trust is None else trust.report()
         allowed = None if report is None else report.target
         if self._part[0].labelled:
@@ -85,7 +85,7 @@ class DayTable(Companion):
         self._write("Each verdict and all scores: --verbose.")
 
     def _figures(self) -> list[str]:
-        """Return the lines of the three most important figures."""
+        """Return three lines of counts in all: slips among `stable`, held lifts kept, `unknown`."""
         published, graspd = self._whole
         return [
             f"`stable` that slipped  {_slips(graspd)}, published {_slips(published)}",

@@ -84,7 +84,7 @@ class LoopTiming:
 
 
 class Loop:
-    """Run one hand in one thread, until stopped or until a recording ends."""
+    """Run one hand in one thread until a signal, a sleep of the computer or a recording's end."""
 
     def __init__(
         self,
@@ -98,7 +98,7 @@ class Loop:
     ) -> None:
         """`drivers`: open, the tactile one first; the caller closes them.
 
-        `keep`: calls its argument once all outcomes until now are on the disk.
+        `keep`: calls its argument once all outcomes until now are saved, or cannot be.
         """
         self._drivers = drivers
         self._tactile = drivers[0]
@@ -134,7 +134,7 @@ class Loop:
         self._readings_since_status = 0
 
     def run(self) -> Ended:
-        """Run until something ends the loop; call `close` after it. Raises `DriverError`."""
+        """Run until the loop ends; return why. Call `close` after it. Raises `DriverError`."""
         with closing(self._new_selector()) as selector:
             selector.register(self._stop, selectors.EVENT_READ)
             while self._stop.received is None:
@@ -252,13 +252,13 @@ class Loop:
     def _after_skipped(
         self, skipped: Sequence[TactileReading], newest: TactileReading
     ) -> TactileReading:
-        """Report skipped readings; return `newest`, marked where it repeats the last of them."""
+        """Count skipped readings; return `newest`, `HELD` where a finger repeats the last one."""
         self._shedder.skip(len(skipped), self._clock())
         self._interrupt()
         return mark_repeats(newest, skipped[-1])
 
     def _interrupt(self) -> None:
-        """Have the grasp settle again: readings before the next one are missing."""
+        """Have the grasp settle again, as readings are missing; report this to the companions."""
         self._pipeline.skip()
         for on_event in self._on_event:
             on_event(LoopEvent.SKIPPED)
@@ -287,7 +287,10 @@ class Loop:
         *,
         is_answer: bool = False,
     ) -> None:
-        """Publish a verdict and its reading. `is_answer`: True if it answers waiting questions."""
+        """Publish a verdict and its reading; None: silence.
+
+        `is_answer`: it answers waiting questions even without a judgement.
+        """
         silence_ns, period_ns = self._silence_ns, self._tactile.period_ns
         self._silence_due_ns = received_ns + silence_ns
         if reading is not None:
@@ -340,11 +343,14 @@ class Loop:
             on_event(LoopEvent.ASKED)
 
     def silence(self) -> None:
-        """Publish that no reading has come."""
+        """Publish the verdict `unknown`, with reason `stale`: no reading has come."""
         self._report_silence(self._clock())
 
     def outcome(self, report: Report, answer: Answer) -> None:
-        """Learn, publish and save the outcome of a lift; call `answer` once saved or refused."""
+        """Learn, publish and save the outcome of a lift; call `answer` once saved or refused.
+
+        `not-lifted` takes back that the grasp may be lifted.
+        """
         lifts, grasp = self._pipeline.lifts, report.grasp
         if grasp.boot_id == self._outbox.boot_id:  # the lift book of a replay has the recorded ids
             grasp = GraspId(self._pipeline.boot_id, grasp.grasp)

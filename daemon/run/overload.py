@@ -18,9 +18,10 @@ import numpy as np
 from graspd.drivers.base import ElectrodeFault, TactileReading
 
 BACKLOG_MAX_NS: Final = 10_000_000
-"""Longest backlog whose readings are all judged, ns; one sensor period if that is longer."""
+"""Time to judge a backlog above which readings are skipped, ns; the sensor period if longer."""
 COST_SAMPLES: Final = 4
-"""Number of latest readings whose shortest time to judge is the cost, so a stall does not count."""
+"""Number of latest readings. The shortest time to judge one is expected for the next, so that one
+stall does not count."""
 REPORT_AFTER_NS: Final = 3_000_000_000
 """Duration of skipping after which overload is reported, ns."""
 PAUSE_NS: Final = 1_000_000_000
@@ -40,7 +41,7 @@ log = logging.getLogger("graspd")
 
 
 class LoadShedder:
-    """Decide which readings to skip, and report a lasting overload."""
+    """Decide which readings to skip, report a lasting overload, and yield the processor."""
 
     def __init__(
         self, now_ns: int, *, live: bool, sleep: Callable[[float], None] = time.sleep

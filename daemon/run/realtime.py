@@ -34,7 +34,7 @@ class RealtimeMode(Companion):
         """Refused parts of realtime mode, each with advice on how to allow it."""
 
     def __enter__(self) -> Self:
-        """Set the priority of this thread, and everything else for the process."""
+        """Set this thread's priority; pin the process, lock its memory, stop garbage collection."""
         options = self._options
         if options.cpus is not None:
             self._pin(set(options.cpus))

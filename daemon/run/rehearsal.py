@@ -19,9 +19,9 @@ PERIOD_NS = 10_000_000
 REST = 110
 """Number of untouched readings before the first grasp; a tare takes 100."""
 GRASP_EVERY, CLOSING, HELD = 65, 5, 45
-"""Numbers of readings of a whole grasp, of closing or opening, and of holding."""
+"""Numbers of readings from one grasp to the next, of closing or opening, and of holding."""
 FALL_COUNTS = 150.0
-"""Unit of an electrode's fall, counts; in a typical grasp it falls by 0 to 3 units."""
+"""Unit of the fall of an electrode's count in a grasp; electrodes fall by 0 to 3 units."""
 COUNTS_MAX = 4000.0
 """Highest count of an electrode at rest, below saturation."""
 
@@ -29,7 +29,7 @@ COUNTS_MAX = 4000.0
 def grasps(training: SeenCounts, readings: int) -> Iterator[NDArray[np.uint16]]:
     """Yield counts, shape (fingers, 24): a rest to tare, then grasps like those of `training`.
 
-    `readings`: number of counts after the rest.
+    `readings`: number of readings after the rest.
     """
     # The grasp is one standard deviation off along each axis, as the centre is unlike any grasp.
     sides = 1.0 - 2.0 * (np.arange(np.size(training.centre)) % 2)
@@ -51,7 +51,7 @@ def grasps(training: SeenCounts, readings: int) -> Iterator[NDArray[np.uint16]]:
 def rehearse(plan: Plan) -> Pipeline:
     """Judge a synthetic grasp; return the pipeline used. Raises `ModelError`.
 
-    It has a model of its own, because judging changes the scaling of a model's inputs.
+    It loads a model of its own, because judging changes the scaling of a model's inputs.
     """
     now_ns = 0
     model = assembly.load_model(plan.scene)

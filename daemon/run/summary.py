@@ -24,7 +24,7 @@ COLOURS = {Decision.STABLE: Colour.GREEN, Decision.SLIP: Colour.RED}
 WINDOW: Final = 50
 """Number of `stable` lifts in a row among which `Tally.worst` counts the slips."""
 WAITING_MAX: Final = 1024
-"""Most grasps that wait for their outcome."""
+"""Most grasps that wait for their outcome; beyond it the oldest is dropped."""
 WORTH: Final = {
     "coverage": "coverage",
     "slips_among_stable": "slips among stable",
@@ -32,7 +32,7 @@ WORTH: Final = {
     "slips_called_stable": "slips called stable",
     "stable_called_slip": "stable called slip",
 }
-"""Texts of the figures of `Tally.worth`, in order."""
+"""Printed names of the fractions in `Tally.worth`, in order."""
 
 
 class Tally:
@@ -79,7 +79,10 @@ class Tally:
                 self.worst = max(sum(self._latest), self.worst or 0)
 
     def scores(self) -> dict[str, float] | None:
-        """Return the scores of judged grasps with outcomes; slip is positive. None: no grasp."""
+        """Return accuracy, precision, recall, f1 of judged grasps with outcomes; slip is positive.
+
+        None: no such grasp. A score that would divide by 0 is left out.
+        """
         hit, miss = self.confusion[True, True], self.confusion[True, False]
         false_alarm, rest = self.confusion[False, True], self.confusion[False, False]
         total = hit + miss + false_alarm + rest
@@ -95,7 +98,10 @@ class Tally:
         )
 
     def worth(self) -> dict[str, float] | None:
-        """Return the figures named in `WORTH`, 0..1, except those of 0 lifts. None: no outcome."""
+        """Return the fractions (0..1) named by the keys of `WORTH`; None: no outcome is known.
+
+        Those of 0 lifts are left out.
+        """
         if not self.labelled:
             return None
         (stable, slips), held = self.stable, self.confusion[False, False]
@@ -123,7 +129,7 @@ class Tally:
         return ", ".join(f"{self.decisions[decision]} {decision}" for decision in Decision)
 
     def lines(self) -> Iterator[str]:
-        """Yield reasons and scores, for people."""
+        """Yield lines for people: reasons, scores, and the fractions of `worth`."""
         if self.reasons:
             given = ", ".join(f"{number} {reason}" for reason, number in self.reasons.most_common())
             yield f"unknown because: {given}"
@@ -139,7 +145,7 @@ class Tally:
 
 
 def _fractions(parts: Mapping[str, tuple[int, int]]) -> dict[str, float]:
-    """Return each part divided by its whole; a whole of 0 is left out."""
+    """Return part / whole by name, from (part, whole); a whole of 0 is left out."""
     return {name: part / whole for name, (part, whole) in parts.items() if whole}
 
 
@@ -152,7 +158,7 @@ class RunSummary:
     def __init__(self) -> None:
         self.tally = Tally()
         self.trained_on: Mapping[str, str] = {}
-        """Recordings that the model was trained on, and the text for people."""
+        """Names of recordings that the model was trained on, each with a text for people."""
         self._waiting: dict[GraspId, Decision] = {}
         """Decisions on grasps whose outcome may still come, the oldest first."""
         self.repaired = 0
@@ -198,7 +204,7 @@ class RunSummary:
             self.tally.outcome(decision, slipped=slipped)
 
     def as_dict(self, wall_s: float, trust: Trust | None) -> dict[str, Any]:
-        """Return everything as values for JSON. `wall_s`: time of the replay, s."""
+        """Return counts, scores, risk and latencies for JSON. `wall_s`: duration of the run, s."""
         return {
             **self.tally.as_dict(),
             "gated": self._gated(),

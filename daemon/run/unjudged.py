@@ -27,7 +27,7 @@ STEP_MIN_S: Final = 1e-4
 UNITS: Final = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
 """Names of units in which times may be by mistake, by the number of units in a second."""
 CAUSES_MAX: Final = 3
-"""Most reasons to write."""
+"""Most reasons to write, the most frequent ones."""
 
 
 class Unjudged(Companion):

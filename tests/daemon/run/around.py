@@ -140,18 +140,18 @@ class Disk:
 
 
 class Controller:
-    """A program that asks whether it may lift, lifts, and tells the outcome: late, or never."""
+    """A program that asks whether it may lift, lifts, and later reports the outcome, or never."""
 
     def __init__(self, world: World, door: Door, name: bytes, user: bytes) -> None:
         self.world, self.door, self.known = world, door, Peer(name, user)
         self.asked_ns: int | None = None
-        """Working time of the open question, ns; None: no question is open."""
+        """`World.worked_ns` at the open question; None: no question is open."""
         self.lifts = False
         self.told: tuple[GraspId, str] | None = None
         self.offers: set[GraspId] = set()
-        """Offers that were answered, and nothing of them was acknowledged."""
+        """Grasps that it was offered to lift, and whose outcome is not acknowledged yet."""
         self.kept: set[GraspId] = set()
-        """Outcomes that were acknowledged."""
+        """Grasps whose outcome was acknowledged."""
         self.last: dict[str, Any] = {}
 
     def ask(self, *, lifts: bool = True) -> None:

@@ -55,7 +55,7 @@ TROUBLE_NS, CALM_NS = 12 * S, 9 * S
 OPEN_MS = 100
 """Time for which the hand stays open after each verdict with the reason `not-tared`, ms."""
 WITHHELD = {"low-confidence", "unproven", "risk-exceeded", "not-calibrated", "never-seen"}
-"""Reasons for which a sound, settled grasp may be `unknown`, by earlier outcomes and grasps."""
+"""Reasons, due to earlier outcomes or grasps, why a sound, settled grasp may be `unknown`."""
 
 
 @cache
@@ -227,7 +227,7 @@ class Day:
         return scenes.parse(text, folder / "scene.toml")
 
     def run(self, shifts: int) -> None:
-        """Run the daemon, again after each end, for `shifts` shifts; fail if a promise breaks."""
+        """Run the daemon, again after each end, for `shifts` times of trouble, and check it."""
         self._plan(shifts)
         while not self.is_over:
             with self._replaced():
@@ -346,7 +346,10 @@ class Day:
         self.sensors.take(self.sensors.grasps[0])
 
     def _be_calm(self) -> None:
-        """End all faults; switch the sensors off once, as a wrong tare would last half a minute."""
+        """End all faults; switch the sensors off once, as a wrong tare would last half a minute.
+
+        Plan a sound grasp, a question, and the check that it was judged.
+        """
         self.world.has_trouble, self.world.kill_ns = False, None
         self.sensors.faults.clear()
         self.sensors.switch_off()

@@ -201,7 +201,8 @@ def test_a_reading_is_sent_only_while_there_is_a_subscriber() -> None:
 
 
 class Peer(Companion):
-    """Asks and reports an outcome before every wait; keeps the answers and all that follows."""
+    """Asks and reports a slip before every wait; keeps the replies in `refused`, and in `heard`
+    all events, outcomes and verdicts."""
 
     def __init__(self, boot_id: str) -> None:
         self.boot_id = boot_id
@@ -269,7 +270,7 @@ def test_outcomes_are_answered_once_saved_and_then_as_repeated() -> None:
 
 
 def test_a_replay_takes_outcomes_that_name_its_own_start() -> None:
-    """The book of lifts has the grasp under the recorded start's id, but is told the replay's."""
+    """The book of lifts has the grasp under the recorded start's id, the report the replay's."""
     clock = Clock()
     bench = LoopBench(FakeDriver([reading(clock())], clock), clock, boot_id=BOOT)
     bench.pipeline.boot_id = "e" * 32
@@ -324,7 +325,7 @@ class Exchanging(FakeDriver):
         return {"ff": "A" if self.counters.readings < 3 else "B"}
 
 
-def test_an_exchanged_sensor_is_noticed_before_its_first_reading() -> None:
+def test_a_changed_serial_number_is_noticed_before_judging_that_reading() -> None:
     clock = Clock()
     driver = Exchanging([reading(clock(), seed) for seed in range(4)], clock)
     published_at_exchange: list[int] = []

@@ -108,7 +108,7 @@ def test_in_overload_the_newest_are_judged_and_all_are_counted(times: float) -> 
     [[PERIOD_NS * 9 // 10] * 101, [0] * 20 + [95 * MS] + [MS // 2] * 80],
     ids=["nearly a period each", "one stall"],
 )
-def test_no_reading_is_skipped_if_all_are_judged_in_time(costs: list[int]) -> None:
+def test_nothing_is_skipped_if_the_backlog_takes_under_10_ms(costs: list[int]) -> None:
     clock, each = Clock(), iter(costs)
     bench = OverloadedLoop(LiveDriver(stream(1.0), clock), clock, lambda: next(each))
     assert [seen.seq for _, seen in bench.judged] == list(range(100))
@@ -274,7 +274,7 @@ def test_a_loop_kept_busy_by_its_selector_yields_the_processor() -> None:
 
 
 def test_a_reading_marked_interrupted_makes_the_grasp_settle_again() -> None:
-    """The counts continue as before; only the sender says that it began again."""
+    """The counts continue as before; only the mark says that the sender began again."""
     clock, random = Clock(), np.random.default_rng(3)
     came: list[Reading] = []
     for seq, pose in enumerate(["rest"] * 150 + ["grasp"] * 100):

@@ -43,7 +43,7 @@ def as_before() -> Iterator[None]:
 
 
 def in_a_process(text: str, folder: Path) -> str:
-    """Return the output of `text`, run in another process, which may give up rights for good."""
+    """Return the output of the Python code `text`, run in a process that may give up rights."""
     return subprocess.run(
         [sys.executable, "-c", WORLD + text],
         cwd=Path(__file__).parents[3],

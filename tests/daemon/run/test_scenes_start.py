@@ -1,4 +1,4 @@
-"""Drawn scenes in which `check` finds no error start, up to the open link."""
+"""Drawn scenes in which `check` finds no error start, except their links."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def as_toml(value: object) -> str:
 
 
 def start(path: Path) -> None:
-    """Start a scene as `run` does, up to the open link; ignore links that cannot be opened."""
+    """Open all that `run` opens, without the loop; ignore links that cannot be opened."""
     parts = prepare(path)
     with ExitStack() as stack:
         around = Assembly(parts, stack)

@@ -1,4 +1,4 @@
-"""After a sleep, which stops the monotonic clock, no earlier reading gives a verdict."""
+"""After a sleep, which stops the monotonic clock, no earlier reading is judged."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ HOUR_NS = 3600 * 1000 * MS
 
 
 class Sleeper(FakeModel):
-    """Model during whose third run the computer sleeps."""
+    """Model during whose third run the computer sleeps, which moves only the clock `boot`."""
 
     def __init__(self, boot: Clock) -> None:
         super().__init__()
