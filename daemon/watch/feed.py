@@ -56,7 +56,7 @@ class Feed:
     ) -> None:
         """Connect. Raises `zmq.ZMQError` for a wrong endpoint.
 
-        `keys`: from `load_keys`; None: no keys. `clock`: returns ns, and runs on in a sleep.
+        `keys`: from `load_keys`; None: no keys. `clock`: returns ns, also of a sleep.
         """
         self.link = Link.CONNECTING
         self._endpoint = endpoint

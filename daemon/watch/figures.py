@@ -56,7 +56,7 @@ def rests_on(verdict: Verdict) -> str:
 
 
 def stillness(still_ms: float | None) -> str:
-    """Return how long a hand has been still; `-` if that is not known."""
+    """Return as text how long a hand has been still, and whether it may slide; `-`: not known."""
     if still_ms is None:
         return "-"
     whole_ms = int(still_ms)

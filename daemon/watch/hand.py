@@ -103,15 +103,15 @@ def _motion(verdict: Verdict, finger: Finger) -> FingerMotion | None:
 
 
 class GraspLog:
-    """The latest `GRASPS_MAX` grasps of a hand, each with its last verdict."""
+    """The latest `GRASPS_MAX` judged grasps of a hand, each with its last judgement."""
 
     def __init__(self) -> None:
         self._judged: dict[Key, tuple[Verdict, int]] = {}
-        """Last verdict of each grasp, and its time of arrival, ns; the newest last."""
+        """Last judgement of each grasp, and its time of arrival, ns; the newest last."""
         self._ended: dict[Key, str] = {}
 
     def take(self, verdict: Verdict, now_ns: int) -> None:
-        """Take in a verdict that arrived at `now_ns`, monotonic."""
+        """Take in a verdict of `now_ns`, monotonic, if it judges a grasp or repeats a judgement."""
         key = verdict.boot_id, verdict.grasp
         confirms = verdict.valid and key in self._judged
         if confirms or (verdict.judged and (verdict.valid or verdict.gate is not None)):

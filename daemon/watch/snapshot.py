@@ -88,12 +88,12 @@ class FingerImage(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class JudgedGrasp(msgspec.Struct, frozen=True, kw_only=True):
-    """A grasp and its last verdict, which may no longer hold."""
+    """A grasp and its last judgement, which may no longer hold."""
 
     verdict: str
     p_slip: float | None
     boot_id: str
-    """Start of the daemon that `grasp` counts from."""
+    """Id of the daemon's start, from which `grasp` counts."""
     grasp: int
     ago_s: float
     lift: str

@@ -205,7 +205,7 @@ def _table() -> Table:
 
 
 def _verdict(seen: Snapshot, *, wraps: bool = False) -> Text:
-    """Return the verdict, the word of its reason, and the parts to act on."""
+    """Return a line: hand, verdict, probability, first reason, parts to act on."""
     name = printable(seen.hand or "-", NAME_MAX)
     why = seen.why[0].what if seen.why else ""
     if seen.not_well:

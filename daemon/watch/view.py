@@ -47,7 +47,7 @@ OVERLOADED = Line(
     "the PC is too busy to judge each reading: end other programs, or use a smaller model",
 )
 LATE_SHARE = 0.05
-"""Share of late readings in a second from which on they are a problem."""
+"""Share of late readings in a second above which they are a problem."""
 FOLLOW = frozenset({Reason.SEQUENCE_GAP, Reason.STALE, Reason.HELD})
 """Reasons that an overload causes."""
 NO_VERDICT, LEANS = "no verdict yet", "leans to stable"
@@ -244,7 +244,7 @@ class View:
         )
 
     def _verdict_now(self, now_ns: int) -> tuple[Tone, list[Line]]:
-        """Return the current verdict and its reasons. Silence means unknown."""
+        """Return the tone and the reasons to show now; after too long a silence, `SILENT`."""
         verdict = self._verdict
         if verdict is None:
             return Tone.SILENT, [Line("silent", NO_MESSAGE), *self._where_to_look()]
@@ -323,7 +323,7 @@ def _line(reason: Reason) -> Line:
 
 
 def _late(former: Status | None, status: Status) -> int:
-    """Return the number of late readings between two statuses; 0 if it is acceptable."""
+    """Return the number of late readings between two statuses; 0 if acceptable or not known."""
     if former is None or former.boot_id != status.boot_id:
         return 0
     late = status.late_readings - former.late_readings
@@ -332,7 +332,10 @@ def _late(former: Status | None, status: Status) -> int:
 
 
 def _health(status: Status, late: int) -> list[Line]:
-    """Return a line for each reason, with all its parts, in the order in which to act."""
+    """Return lines on overload or `late` readings, then one per reason with all its parts.
+
+    Reasons are in the order in which to act.
+    """
     lines = [OVERLOADED] if status.overloaded else []
     if late and not status.overloaded:
         lines.append(

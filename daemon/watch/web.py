@@ -169,7 +169,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def load_page() -> tuple[bytes, str]:
-    """Return the page, and the policy that lets it run its own script and style alone."""
+    """Return the page, and the content security policy: only its own script and style run."""
     folder = resources.files("graspd.daemon.watch")
     text = folder.joinpath("page.html").read_text("utf-8")
     policy = "default-src 'none'; "

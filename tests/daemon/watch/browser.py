@@ -36,7 +36,7 @@ BANNER = "document.querySelector('.banner')"
 
 @contextlib.contextmanager
 def serving(publish: Callable[[Newest], object], port: int = 0) -> Iterator[Server]:
-    """Serve the page, and put snapshots by `publish` in a thread. `port` 0: any free one."""
+    """Serve the page; call `publish` in a thread, to put snapshots. `port` 0: any free one."""
     server = Server(port, Newest())
     jobs = (lambda: server.serve_forever(0.01)), (lambda: publish(server.newest))
     threads = [threading.Thread(target=job) for job in jobs]
@@ -163,7 +163,7 @@ class Browser:
         self.ask("Emulation.setEmulatedMedia", features=[feature])
 
     def go(self, address: str) -> None:
-        """Open a page."""
+        """Open the page at `address`, without waiting for it."""
         self.ask("Page.navigate", url=address)
 
     def value(self, expression: str) -> Any:  # noqa: ANN401

@@ -1,7 +1,7 @@
 """Makes `deploy/watch.png`: `python -m tests.daemon.watch.picture`, which takes six minutes.
 
-It runs the demo scene and `graspd watch --web`, waits until five minutes are behind it and a grasp
-is `stable` by what lifts have shown, and takes a picture of 1280 x 860.
+It runs the demo scene and `graspd watch --web` for five minutes, waits for a grasp that is `stable`
+and supported by outcomes of lifts, and takes a picture of 1280 x 860 pixels.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ def first_of(publisher: Publisher, feed: Feed, seq: int, decision: Decision) -> 
     return found
 
 
-def test_messages_that_waited_unread_are_not_shown(endpoint: str) -> None:
+def test_messages_unread_for_over_a_second_are_not_shown(endpoint: str) -> None:
     clock = Clock()
     with (
         closing(Peers()) as peers,

@@ -106,7 +106,7 @@ def test_images_go_when_readings_no_longer_come() -> None:
 
 
 def told_of(**told: Any) -> list[FingerImage]:  # noqa: ANN401
-    """Return the images beside a verdict that has the fields `told`."""
+    """Return the images after a verdict that has the fields `told`."""
     reading = b"tactile.right", tactile(0, RESTING, RESTING)
     return after(reading, (b"verdict.right", verdict(0, **told))).snapshot(0).fingers
 

@@ -96,7 +96,7 @@ def test_names_that_come_in_messages_cannot_move_the_cursor() -> None:
     assert r"\x1b[2J" in text
 
 
-def test_lines_that_do_not_fit_are_shown_by_space() -> None:
+def test_lines_that_do_not_fit_are_shown_page_by_page() -> None:
     places = [f"{finger}_{place}" for finger in ("ff", "mf", "th") for place in range(1, 25)]
     health = dict(zip(places, [*Reason, *Reason, *Reason], strict=False))
     view = after((b"status.right", status(0, health=health)), (b"verdict.right", verdict(0)))

@@ -124,7 +124,7 @@ def test_other_hands_and_other_topics_are_ignored() -> None:
         ([Reason.LOW_CONFIDENCE], Tone.WAITING),
     ],
 )
-def test_unknown_shows_whether_something_is_wrong(reasons: list[Reason], tone: Tone) -> None:
+def test_the_tone_of_unknown_shows_if_something_is_wrong(reasons: list[Reason], tone: Tone) -> None:
     seen = seen_after(reasons=reasons)
     assert seen.tone is tone
     why = [(reason.value, ADVICE[reason]) for reason in reasons]

@@ -165,7 +165,7 @@ def test_a_browser_silent_within_a_request_is_cut_off(
         assert has_ended(link)
 
 
-def test_closing_ends_pages_that_wait() -> None:
+def test_closing_the_server_ends_connections_that_wait() -> None:
     with ExitStack() as stack:
         with serving(lambda _newest: None) as server:
             waiting = opened(server, stack)
