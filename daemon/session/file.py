@@ -26,7 +26,7 @@ DIGEST_BYTES: Final = 32
 
 
 class SessionFileError(Exception):
-    """The kept session cannot be read or written."""
+    """A kept session cannot be read or written, or is of other fingers or another model."""
 
 
 class KeptSession(
@@ -86,7 +86,7 @@ def load(path: Path) -> KeptSession:
 
 
 def write(path: Path, kept: KeptSession) -> None:
-    """Replace a file in one step. Raises `OSError`."""
+    """Write `kept`, with the present time, in place of a file, in one step. Raises `OSError`."""
     stamped = replace(kept, saved_at=time.time())
     content = zlib.compress(msgspec.msgpack.encode(stamped), 1)
     write_atomically(path, hashlib.sha256(content).digest() + content)

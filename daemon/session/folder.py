@@ -47,9 +47,10 @@ class SessionFolder:
         self._lock: int | None = None
 
     def lock(self) -> None:
-        """Make and lock the folder, once. Raises `SessionFileError` if it is in use.
+        """Make and lock the folder, once.
 
-        Raises `SceneError` where there is no Linux.
+        Raises `SessionFileError` if it is in use, or cannot be made or locked, and `SceneError`
+        where there is no Linux.
         """
         if self._lock is not None:
             return
@@ -101,7 +102,8 @@ class SessionFolder:
     def save(self, sessions: Sequence[KeptSession]) -> None:
         """Save these sessions, first the one that runs, in place of those that were loaded.
 
-        Raises `SessionFileError`, after which the sessions on the disk are whole.
+        The others: the last used first, limited as `KEPT_MAX` says. Raises `SessionFileError`,
+        after which the sessions on the disk are whole.
         """
         if self._lock is None:
             self._lock_late()

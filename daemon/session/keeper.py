@@ -42,7 +42,7 @@ WAIT_S: Final = 0.4
 SAVE_PERIOD_NS: Final = 10_000_000_000
 """Time between two saves, ns, while no outcome waits."""
 WAITING_MAX: Final = 64
-"""Most answers that wait for the disk. With one more, the oldest is given as `busy`."""
+"""Most answers that wait for the disk. With one more, the oldest gets the reply `busy`."""
 BUSY: Final = Reply(Told.BUSY, "too many wait for the disk, tell it again")
 HANGS: Final = Reply(Told.NOT_KEPT, "the disk does not answer")
 UNEXPECTED: Final = "it could not be written"
@@ -132,7 +132,7 @@ class SessionKeeper(SensorWatch):
         self._answer(self._in_writing, Reply(Told.NOT_KEPT, why))
 
     def _start_save(self) -> None:
-        """Start a save of the present state, with all waiting outcomes, unless one runs."""
+        """Start a save of the present state, unless one runs; answer at once if nothing is new."""
         if self._worker.busy:
             return
         self._save_due_ns = self._clock() + SAVE_PERIOD_NS
@@ -229,7 +229,7 @@ class SessionKeeper(SensorWatch):
         return replace(used, trust=next(learned, None))
 
     def _fits(self, seeded: KeptSession) -> bool:
-        """Return True if the grasps of the running, uncalibrated session fit a seeded one."""
+        """Return True if `FIT_GRASPS` grasps or more of an uncalibrated session fit `seeded`."""
         session, known = self._session, seeded.statistics
         if session is None or session.calibrated or session.grasps < FIT_GRASPS:
             return False
@@ -329,7 +329,8 @@ def _restore_trust(
     trust: Trust | None, used: KeptSession, kept: Sequence[KeptSession], problems: list[str]
 ) -> KeptSession | None:
     """Restore this model's last learning with the sensors of `used`; return its session. None: it
-    has none, or it cannot be restored, which is added to `problems`."""
+    has none, or it cannot be restored, which is added to `problems`. `trust` None: only return it.
+    """
     why: list[str] = []
     for each, learned in _taught_with(used, kept):
         try:

@@ -37,7 +37,7 @@ hand. An untouched sensor changes by 1 in ten seconds.
 FIT_GRASPS: Final = 10
 """Fewest grasps by which unknown sensors are compared with a seeded session."""
 FIT_SPREADS: Final = 1.0
-"""Largest distance at which these grasps' mean fits a seeded session, in the session's spreads.
+"""Largest distance of their mean from a seeded session that fits, in its standard deviations.
 
 The distance is the root mean square over the electrodes of a finger, of the finger that is farthest
 off. For ten grasps of a published day it is 0.2 to 0.8 (1 to 99 %) to that day's session, and
@@ -46,7 +46,7 @@ at least 1.6 to another day's.
 KNOWN_MIN: Final = 12
 """Fewest electrodes of a finger, known in both rests, by which the rests are compared."""
 FOLLOWED_COUNTS: Final = 5.0
-"""Smallest change of an electrode, counts, that is saved; each save writes to the disk."""
+"""Change of a resting count above which the rest is saved; each save writes to the disk."""
 LOOK_EVERY: Final = 5
 """Number of readings between two checks of the rest; a grasp takes longer to settle."""
 
@@ -119,14 +119,14 @@ class SensorWatch(Companion):
         return None
 
     def _begin(self, _former: KeptSession | None, *, tared: bool = False) -> None:
-        """Continue a former session, or begin an empty one (None). `tared`: the sensors rest as in
-        the former session."""
+        """Have the judge forget the former sensors. `SessionKeeper` continues the session `_former`
+        or begins an empty one (None). `tared`: the sensors rest as in `_former`."""
         self._sensors_exchanged()
         self._rest = None
 
 
 def exchanged(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
-    """Return the fingers whose serial number has changed."""
+    """Return the fingers whose serial number was known before and has changed."""
     return [finger for finger in now if before.get(finger, now[finger]) != now[finger]]
 
 
@@ -162,5 +162,5 @@ def fits(seeded: SessionState, seen: SessionState, fingers: int) -> bool:
 
 
 def has_drifted(before: Rest, now: Rest) -> bool:
-    """Return True if an electrode has drifted enough to be saved."""
+    """Return True if an electrode has drifted enough that the rest is saved."""
     return bool((np.abs(now - before) > FOLLOWED_COUNTS).any())

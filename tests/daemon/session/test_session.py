@@ -33,7 +33,7 @@ from tests.daemon.session.learning import (
 )
 
 
-def test_a_new_session_begins_if_the_kept_does_not_fit(
+def test_a_new_session_begins_if_kept_statistics_have_another_size(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     session, driver = calibration(), sensors(ff="A")
@@ -121,7 +121,7 @@ def test_a_grasp_with_a_dead_finger_is_always_unknown(bts3_dir: Path, grasps: in
 
 
 @pytest.mark.parametrize("order", [[0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]])
-def test_fingers_exchanged_from_the_first_grasp_are_unknown(
+def test_verdicts_are_unknown_if_fingers_are_swapped_from_the_start(
     bts3_dir: Path, order: list[int]
 ) -> None:
     rows = read_table(bts3_dir / "palm_side.csv").counts
@@ -150,7 +150,7 @@ def test_a_session_of_mostly_slips_makes_hardly_more_slips_stable(bts3_dir: Path
 
 
 @pytest.mark.parametrize("name", ["cnn1", "small-session"])
-def test_the_mean_of_all_training_grasps_is_never_judged(name: str) -> None:
+def test_readings_near_the_mean_of_training_grasps_are_unknown(name: str) -> None:
     model = TactileModel(zoo.find(name))
     random = np.random.default_rng(5)
     centre = np.array(model.contract.seen.centre)
