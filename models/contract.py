@@ -38,7 +38,7 @@ class Dataset(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class MeasuredError(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Scores on held-out data, mean and deviation over the folds; slip is positive."""
+    """F1 (slip positive) and accuracy on held-out data: mean and deviation over the folds."""
 
     protocol: str
     """`cv`: known objects; `unknown`, `objects`: new objects; `session`, `days`: other days."""
@@ -68,7 +68,7 @@ class SeenCounts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     distance_max: Annotated[float, msgspec.Meta(gt=0.0)]
     """Largest root-mean-square whitened deviation of a reading that is like the training."""
     distance_min: Annotated[float, msgspec.Meta(ge=0.0)] = 0.0
-    """Smallest such deviation; a reading below it is the mean of all grasps, not a real grasp."""
+    """Smallest such deviation; a reading below it is nearer to the mean than any real grasp."""
 
     def whitening_matrix(self) -> NDArray[np.float64]:
         """Return L of `whitening`, lower triangular, shape (electrodes, electrodes), 1/counts."""

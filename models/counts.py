@@ -56,7 +56,7 @@ def column_names(given: object) -> list[str]:
 
 
 def fingers_of(names: Sequence[str]) -> tuple[Finger, ...]:
-    """Return the fingers whose first electrode is a column here, in the order of the hand."""
+    """Return the fingers whose first electrode is in the column `names`, in the hand's order."""
     return tuple(finger for finger in FINGERS if electrode_columns(finger)[0] in names)
 
 
@@ -74,7 +74,7 @@ def write_csv(table: Any, folder: str) -> Path:  # noqa: ANN401
 
 
 def _cells(column: Any, what: str) -> list[Any]:  # noqa: ANN401
-    """Return the values of a column as they are written into a file."""
+    """Return a column's values as they are written into a file; `what` names it in errors."""
     values: Any = np.ma.array(column)
     _refuse_rounded(values.dtype, what)
     if values.dtype.kind == "b":
@@ -131,7 +131,10 @@ def _columns(table: Any, needed: Sequence[str], names: Sequence[str]) -> dict[st
 
 
 def _numbers(given: Any, what: str) -> NDArray[np.float64]:  # noqa: ANN401
-    """Return values as numbers, NaN for missing or masked ones. Raises `ValueError` for text."""
+    """Return values as numbers, NaN for missing or masked ones; `what` names them in errors.
+
+    Raises `ValueError` for text, float16 and lists of different lengths.
+    """
     try:
         # numpy loses the masks of arrays within lists.
         nested = isinstance(given, list | tuple) and any(

@@ -24,7 +24,7 @@ beyond this limit. Repairing it changes F1 by at most 0.3 points. Leaving four w
 unrepaired costs 3 to 40 points.
 """
 CONTRADICTING_MAX = 2
-"""Most electrodes that may contradict the others if no other fault of theirs is known.
+"""Most electrodes, besides those known to be broken, that may contradict the others.
 
 With this limit 99 % of the held-out grasps are judged, and no reading whose electrodes come from
 different grasps. With a limit of four, a tenth of those would be judged.
@@ -83,7 +83,7 @@ class Examination(NamedTuple):
     seen: bool
     """True if the reading is like the training, so that a network may judge it."""
     learned: bool
-    """True if a session may learn from it."""
+    """True if a session may learn from the reading."""
 
 
 class Electrodes:
@@ -219,7 +219,7 @@ class Electrodes:
         return self._square_min <= square <= share**2 * self._square_max
 
     def is_learned(self, square: float) -> bool:
-        """Return True if a session may learn from a mapped reading with this mean square."""
+        """Return True if a session may learn from a reading with this mean square deviation."""
         return square <= LEARNED_DISTANCES**2 * self._square_max
 
 

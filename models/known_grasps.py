@@ -17,7 +17,7 @@ from graspd.models.contract import ModelError
 from graspd.models.runtime import TactileModel
 
 METADATA_KEY = "graspd-grasps"
-"""Entry of an ONNX file beside its contract: the hashes of `as_text`."""
+"""Key of an ONNX file's metadata, beside its contract, of the training grasps' `as_text`."""
 PUBLISHED = zoo.ZOO / "published-grasps.crc32"
 """Hashes of the grasps of all published tables, little-endian, in the order of `TABLES`."""
 

@@ -25,7 +25,7 @@ FULL_COUNTS = 1600.0
 Levels grow with the square root, so a touch of 20 counts has level 11.
 """
 FULL_DEVIATIONS = 2.5
-"""Deviation at level `FULL` without resting counts, in standard deviations of the finger."""
+"""Fall below the finger's median, in its standard deviations, at `FULL` without resting counts."""
 SHARE = 0.02
 """Weight of a new reading in the resting counts, which at 100 Hz follow within half a second."""
 STRAY_COUNTS = 20.0
@@ -50,7 +50,7 @@ class RestCounts:
         return self._means[finger] if self._readings[finger] >= KNOWN_AFTER else None
 
     def learn(self, finger: str, counts: NDArray[np.float64], sound: NDArray[np.bool_]) -> None:
-        """Learn the `sound` electrodes of a finger without contact; shapes (24,)."""
+        """Learn from counts of a finger without contact, where `sound` is True; shapes (24,)."""
         mean = self._means.setdefault(finger, np.zeros(ELECTRODES))
         strays = counts - mean
         if self.of(finger) is not None:

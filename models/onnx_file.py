@@ -63,7 +63,7 @@ class _Node:
 
 
 def check(content: bytes) -> None:
-    """Raise `ModelError` unless a model is complete and each of its operators surely ends."""
+    """Raise `ModelError` unless a model is self-contained and its operators surely end."""
     _Reader(memoryview(content)).check()
 
 
@@ -262,7 +262,7 @@ def _reached(
 
 
 def _varint(message: memoryview, at: int) -> tuple[int, int]:
-    """Return the variable-length integer at `at`, and the place after it."""
+    """Return the variable-length integer at `at`, and the place after it. Raises `ModelError`."""
     value = 0
     for place in range(VARINT_BYTES_MAX):
         if at + place >= len(message):

@@ -91,7 +91,7 @@ def read(path: Path) -> ModelFile:
 
 
 def check_operators(path: Path, data: bytes) -> None:
-    """Raise `ModelError` unless the file is complete and its operators surely end."""
+    """Raise `ModelError` unless the file is self-contained and its operators surely end."""
     from graspd.models import onnx_file  # not needed for models of the zoo
 
     try:

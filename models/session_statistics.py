@@ -31,7 +31,7 @@ shrink with each repetition. Noise of 5 counts gives at most 0.11 of the trainin
 BALANCED_FROM = 20
 """Grasps after which verdicts are good enough to balance stable grasps and slips."""
 SHARE_GRASPS = 50.0
-"""Number of grasps over which the share of slips is counted."""
+"""Number of latest grasps over which the share of slips is averaged."""
 LEAST_WEIGHT = 0.02
 """Smallest weight of a slip; above zero, so that a session that began wrongly recovers."""
 
@@ -107,7 +107,7 @@ class SessionStatistics:
         self._settle()
 
     def observe(self, values: NDArray[np.float64], *, slip: bool | None = None) -> bool:
-        """Take in one grasp; return False if it repeats the last one, or is not finite.
+        """Take in one grasp; ignore it, and return False, if it repeats the last or is not finite.
 
         `slip`: its verdict; None: not judged. Among many slips each weighs less, because a
         mean that moves to the slips would make the next slip look stable.

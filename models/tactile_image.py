@@ -150,8 +150,8 @@ class TactileImager(InputBuilder):
     def build_batch(
         self, counts: NDArray[np.generic]
     ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-        """Return images and spreads, each made by `build`, so that training and daemon agree
-        exactly."""
+        """Return images (N, *shape) and spreads (N, fingers), each made by `build`, so that
+        training and daemon agree exactly."""
         images = np.empty((len(counts), *self.shape), dtype=np.float32)
         spreads = np.empty((len(counts), self._planes[2]))
         for index, reading in enumerate(counts):

@@ -41,7 +41,7 @@ passed: deque[str] = deque(maxlen=8)
 def load(path: Path, file: ModelFile | None = None) -> TactileModel:
     """Return the model at `path`, after a trial in a process of its own if it is not of the zoo.
 
-    Raises `ModelError`, also if the model is too slow or large.
+    Raises `ModelError`, also if the model is too slow or takes too much memory.
 
     `file`: its content, if it was read before.
     """
@@ -95,7 +95,7 @@ def _try(path: Path, content: bytes) -> None:
 
 
 def main() -> None:
-    """Try the model that stdin holds, in its own process; print why it is refused."""
+    """Try the model on stdin, in its own process; if refused, print why and exit with `REFUSED`."""
     with suppress(ModuleNotFoundError):  # without these limits only its time is limited
         _limit_process()
     path, file = Path(sys.argv[1]), ModelFile(sys.stdin.buffer.read())

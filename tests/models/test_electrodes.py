@@ -51,7 +51,7 @@ def conditional(
     values: NDArray[np.float64],
     out: NDArray[np.bool_],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mean and variance of the electrodes `out` given the rest, by the covariance's blocks."""
+    """Mean and variance of the electrodes `out` given the `values` of the rest, by blocks."""
     cross = covariance[np.ix_(out, ~out)] @ np.linalg.inv(covariance[np.ix_(~out, ~out)])
     expected = mean[out] + cross @ (values[~out] - mean[~out])
     variance = covariance[np.ix_(out, out)] - cross @ covariance[np.ix_(~out, out)]
@@ -180,14 +180,14 @@ def session(**changes: object) -> dict[str, object]:
 @pytest.mark.parametrize(
     ("count", "refused"), [(1750, False), (1749, True), (2250, False), (2251, True), (0, True)]
 )
-def test_a_count_beyond_the_margin_was_never_seen(count: int, refused: bool) -> None:
+def test_counts_beyond_range_and_margin_are_unlike_the_training(count: int, refused: bool) -> None:
     counts = np.full((2, 3, 24), 2000, dtype=np.uint16)
     counts[1, 1, 11] = count
     assert Electrodes(round_numbers()).never_seen(counts).tolist() == [False, refused]
 
 
 @pytest.mark.parametrize(("off", "refused"), [(200, False), (201, True), (-201, True)])
-def test_the_distance_is_the_root_mean_square_deviation(off: int, refused: bool) -> None:
+def test_a_root_mean_square_deviation_above_the_limit_is_refused(off: int, refused: bool) -> None:
     # All 72 electrodes `off` counts from the centre, one spread being 100 counts: distance 2.
     counts = np.full((1, 3, 24), 2000 + off, dtype=np.uint16)
     check = Electrodes(round_numbers(spread=1 / 100, distance_max=2.0))

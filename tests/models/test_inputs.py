@@ -42,7 +42,7 @@ def image_input(composition: Composition) -> ImageInput:
         (session_input(), "features", (78,)),
     ],
 )
-def test_one_reading_is_fed_bit_for_bit_as_in_training(
+def test_one_reading_gives_the_same_input_as_in_a_batch(
     wanted: Input, name: str, shape: tuple[int, ...]
 ) -> None:
     inputs = builder(wanted, 3)
@@ -58,7 +58,7 @@ def test_one_reading_is_fed_bit_for_bit_as_in_training(
 
 
 @pytest.mark.parametrize("wanted", [VectorInput(), session_input(), *map(image_input, Composition)])
-def test_a_flat_finger_has_no_spread_and_no_infinities(wanted: Input) -> None:
+def test_a_flat_finger_has_zero_spread_and_a_finite_input(wanted: Input) -> None:
     inputs = builder(wanted, 3)
     reading = counts(1)[0]
     reading[1] = 2000

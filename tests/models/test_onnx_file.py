@@ -1,4 +1,4 @@
-"""ONNX files with forbidden or endless parts are refused; `onnx` is the other reader."""
+"""ONNX files with forbidden or endless parts are refused; compared with the package `onnx`."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ TREES: dict[str, list[Any]] = {
     "target_ids": [0, 0, 0, 0, 0],
     "target_weights": [1.0, 2.0, 3.0, 4.0, 5.0],
 }
-"""Two trees: tree 0 has two branches, tree 1 has one."""
+"""Attributes of two trees: tree 0 has two branches, tree 1 has one."""
 
 
 def trees(**changed: list[Any]) -> Any:  # noqa: ANN401

@@ -59,7 +59,7 @@ def test_the_figures_of_contract_and_card_are_the_same() -> None:
             assert figures["spreads"]["accuracy"]["mean"] == pytest.approx(accuracy, abs=near)
 
 
-def test_noticed_and_repaired_electrodes_cost_less_than_two_points() -> None:
+def test_up_to_four_repaired_dead_electrodes_cost_under_two_points() -> None:
     for name in zoo.names():
         study = zoo.card(name)["broken"]
         dead = {(b["number"], b["reads"]): b for b in study["broken"]}
@@ -68,7 +68,7 @@ def test_noticed_and_repaired_electrodes_cost_less_than_two_points() -> None:
             assert dead[number, "at 0"]["known"] > study["sound"] - 0.02
 
 
-def test_the_contract_names_the_data_and_its_range(bts3_dir: Path) -> None:
+def test_the_contract_of_cnn1_names_its_tables_and_count_ranges(bts3_dir: Path) -> None:
     columns: list[NDArray[np.int64]] = []
     for stated in CARD["contract"]["datasets"]:
         path = bts3_dir / f"{stated['name']}.csv"
@@ -96,7 +96,7 @@ def test_every_zoo_model_recognises_exactly_its_training_grasps(bts3_dir: Path) 
         assert not known_grasps.are_among(known_grasps.hashes(counts), known).any()
 
 
-def test_calibrated_probabilities_are_near_the_frequencies() -> None:
+def test_zoo_models_are_hardly_less_accurate_than_their_confidence() -> None:
     for card in map(zoo.card, zoo.names()):
         losses = card["protocols"][card["calibrated_by"]]["spreads"]["log_loss"]
         assert losses["mean"] < 0.45
@@ -119,7 +119,7 @@ def test_no_committed_file_names_the_machine_that_made_it() -> None:
         assert not re.search(r"/(tmp|home|usr|work|root)/", text)
 
 
-def test_an_unknown_model_lists_the_known() -> None:
+def test_an_unknown_model_name_lists_the_zoos_models() -> None:
     assert "cnn1" in zoo.names()
     assert zoo.find("cnn1") == zoo.ZOO / "cnn1.onnx"
     with pytest.raises(ModelError, match=r"no model 'cnn9' in the zoo; there are: .*cnn1"):
