@@ -118,7 +118,8 @@ def exit_code(
 def read_grasps(command: str, args: argparse.Namespace) -> Grasps:
     """Return the grasps of `--data` and `--own`. Raises `WrongInputError`, `DatasetError`.
 
-    Warns of tables that have a published name but differ from the published file.
+    Warns of grasps without outcome, rows that nearly repeat others, and tables that have a
+    published name but differ from the published file.
     """
     if args.data is None and not args.own:
         raise WrongInputError("needs --data DIR, --own FILE, or both")
@@ -159,7 +160,7 @@ def check_fingers(systems: Iterable[System], grasps: Grasps) -> None:
 
 
 def say(command: str, text: str) -> None:
-    """Write one line to standard error."""
+    """Write the line `graspd COMMAND: TEXT` to standard error."""
     sys.stderr.write(f"graspd {command}: {text}\n")
 
 
@@ -167,7 +168,7 @@ def say(command: str, text: str) -> None:
 def progress_bar(
     first: str, total: int, *, hidden: bool = False
 ) -> Iterator[Callable[[str], None]]:
-    """Show on stderr, if it is a terminal, how many of `total` trainings are done.
+    """Show on stderr, if a terminal and not `hidden`, how many of `total` trainings are done.
 
     `first`: text of the bar at first. Yields a function to call after each training, with the
     bar's next text.

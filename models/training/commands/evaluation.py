@@ -121,7 +121,8 @@ def _systems(names: Sequence[str]) -> list[System]:
 
 
 def _protocols(args: argparse.Namespace, grasps: Grasps) -> list[EvalProtocol]:
-    """Return the requested protocols; by default all, or of own tables alone `cv` and `objects`."""
+    """Return the requested protocols; by default all, or of own tables alone `cv` and, of several
+    objects, `objects`."""
     if args.protocol or args.data is not None:
         return list(dict.fromkeys(args.protocol or PROTOCOLS))
     if len(set(grasps.objects)) > 1:
@@ -182,7 +183,7 @@ def _evaluated(
 
 
 def _announce(wanted: Sequence[Job], at_once: int) -> None:
-    """Print how many trainings run, and about how long each protocol and system takes if quick."""
+    """Print the number of quick trainings, and their rough time by protocol and by system."""
     jobs = [(job.protocol, job.system.name, quick_seconds(job.system)) for job in wanted]
     took = pd.DataFrame(jobs, columns=["protocol", "system", "seconds"])
     total = f"about {took['seconds'].sum():.0f} s of processor time"

@@ -28,12 +28,12 @@ from graspd.models.training.systems.registry import SYSTEMS, System, with_recipe
 DEFAULT = "small-session"
 SEED = 0
 OTHER_OPTIONS = ("data", "own", "protocol", "seeds", "table", "dask")
-"""Options of `graspd evaluate` for tables that are both trained on and judged."""
+"""Options of `graspd evaluate` that do not go with `--test`."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Model:
-    """A trained model, and what it was trained on."""
+    """A trained model; `known`: hashes of the grasps that it was trained on."""
 
     name: str
     fingers: tuple[Finger, ...]
@@ -103,8 +103,8 @@ def _judge_of(trained: Trained) -> GraspJudge:
 
 
 def _figures(model: _Model, day: Grasps) -> dict[str, Any]:
-    """Judge the grasps of a table in order, from an empty session; return the figures. Warns of
-    grasps on which the model was trained."""
+    """Judge the grasps of a table in order, from an empty session; return `verdict_figures` of
+    those not refused, names, numbers and F1's 95 % interval. Warns of grasps trained on."""
     table = day.files[0].name
     try:
         day = day.of_fingers(model.fingers)
@@ -130,7 +130,8 @@ def _figures(model: _Model, day: Grasps) -> dict[str, Any]:
 
 
 def _judged(judge: GraspJudge, day: Grasps) -> pd.DataFrame:
-    """Judge grasps in order, each learned by the session; return a table with a row for each."""
+    """Judge grasps in order, each learned by the session; return a row for each: `margin`,
+    `refused`, `object`, `slipped`."""
     margins, refused = np.zeros(len(day)), np.zeros(len(day), np.bool_)
     for index, counts in enumerate(day.counts):
         examined = judge.examine(counts)

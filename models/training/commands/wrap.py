@@ -89,8 +89,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _measured(source: Path, grasps: Grasps) -> tuple[MeasuredError, onnx.ModelProto]:
-    """Return measured error and model. A Python file is trained on folds of objects, then on all
-    grasps; an ONNX file is measured on the whole table."""
+    """Return measured scores, and the model with the daemon's input and output. A Python file is
+    trained on folds of objects, then on all grasps; an ONNX file is measured on the whole table."""
     if source.suffix != ".py":
         try:
             network = source.read_bytes()
@@ -186,8 +186,8 @@ def _answers(
 
 
 def _last(answer: str, read: NDArray[np.float32], graph: onnx.GraphProto) -> list[onnx.NodeProto]:
-    """Return the nodes that convert the network's output to two probabilities. `read`: its outputs
-    on the table, by which the form of the output is found."""
+    """Return the nodes that convert the network's output `answer` to two probabilities; add their
+    constants to `graph`. `read`: answers on the table, which show the form of the output."""
     if not np.isfinite(read).all():
         raise ModelError("the network answers grasps of the table with values that are not numbers")
     two = np.array([-1, read.shape[-1]], np.int64)

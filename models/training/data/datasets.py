@@ -29,7 +29,7 @@ FEWEST_GRASPS = 20
 ENOUGH_GRASPS = 200
 """Number of grasps below which a training on lab tables alone is warned of.
 
-Trained on 20 grasps of palm_45, the daemon refuses 98 % of the others as unlike the training; on
+Trained on 20 grasps of palm_45, the daemon refuses 98 % of its others as unlike the training; on
 100 grasps 20 %, on 200 6 %, on 500 2.5 %.
 """
 
@@ -256,7 +256,10 @@ def first_readings(counts: NDArray[np.uint16]) -> Ints:
 
 
 def _check_once(grasps: Grasps, lab: dict[str, Path]) -> None:
-    """Raise `DatasetError` if a grasp occurs twice, as training and test would share it."""
+    """Raise `DatasetError` if a lab table repeats a grasp, as training and test would share it.
+
+    `lab`: path of each lab table by its name.
+    """
     first: dict[bytes, str] = {}
     for table, counts in zip(grasps.table_of.tolist(), grasps.counts, strict=True):
         name, key = grasps.files[table].name, counts.tobytes()

@@ -61,7 +61,7 @@ class Split:
 
 
 def splits(protocol: EvalProtocol, grasps: Grasps, seed: int, folds: int = FOLDS) -> list[Split]:
-    """Return a split for each fold of a protocol; `unknown` has one, `days` some for each day.
+    """Return a split for each fold of a protocol; `unknown` has one, `days` folds for each day.
 
     Raises `TooFewGraspsError` if the data lack a table, objects or grasps.
     """
@@ -75,7 +75,7 @@ def near_copies(grasps: Grasps) -> int:
 
 
 def grasp_of(grasps: Grasps) -> Ints:
-    """Return the number of the grasp that each row is a reading of, shape (N,).
+    """Return for each row the index of the first row of the same grasp, shape (N,).
 
     Rows of lab tables that nearly repeat each other are readings of one grasp; each row of a
     published table is a grasp of its own.
@@ -160,7 +160,7 @@ def _unknown(grasps: Grasps, _seed: int, _folds: int) -> list[Split]:
 
 
 def _session(grasps: Grasps, seed: int, folds: int) -> list[Split]:
-    """Return a split for each fold of objects: test on `palm_45`, training on others in `WHOLE`."""
+    """Return a split for each fold of objects: test in `palm_45`, train on others in `WHOLE`."""
     whole, later = _rows(grasps, *WHOLE), _rows(grasps, NEW_SESSION)
     fold_of = _object_folds(grasps, np.concatenate((whole, later)), folds, seed)
     of_whole, of_later = fold_of[: len(whole)], fold_of[len(whole) :]

@@ -156,7 +156,7 @@ def _model(config: ClassicalConfig, seed: int) -> ClassicalModel:
 
 
 def _mlp_margins(model: MLPClassifier, inputs: Floats32) -> Floats:
-    """Return a perceptron's log-odds of slip (N,), without the logistic, where they saturate."""
+    """Return a perceptron's log-odds of slip (N,), not from probabilities, which saturate."""
     values = inputs.astype(np.float64)
     for weights, bias in zip(model.coefs_[:-1], model.intercepts_[:-1], strict=True):
         values = np.maximum(values @ weights + bias, 0.0)
@@ -253,7 +253,7 @@ def _float32_below(thresholds: Floats) -> Floats32:
 
 
 def _forest(model: RandomForestClassifier, input_name: str) -> onnx.ModelProto:
-    """Return a forest whose trees add whole votes. Shares such as 1/199 would round differently."""
+    """Return a forest's graph. Trees add whole votes: shares such as 1/199 would be rounded."""
     (trees,) = _from_sklearn(model, input_name).graph.node
     number = len(model.estimators_)
     (weights,) = (part for part in trees.attribute if part.name == "class_weights")
@@ -279,7 +279,7 @@ def _forest(model: RandomForestClassifier, input_name: str) -> onnx.ModelProto:
 
 
 def _perceptron(model: MLPClassifier, input_name: str) -> onnx.ModelProto:
-    """Return a perceptron up to its last logistic function, where large margins would saturate."""
+    """Return a perceptron's graph without its last logistic function, which would saturate."""
     graph = _from_sklearn(model, input_name).graph
     kinds = [node.op_type for node in graph.node]
     nodes = list(graph.node[: kinds.index("Sigmoid")])

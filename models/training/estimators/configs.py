@@ -72,8 +72,8 @@ class SecondConvolution:
 class NetworkConfig:
     """A convolutional network: convolution(s), one hidden dense layer, two classes.
 
-    It takes images, or features. The first 24 features of each finger become a D1 image inside the
-    network; the others are inputs of the hidden layer.
+    It takes images, or vectors. The 24 electrodes of each finger in a vector become a D1 image
+    inside the network; other features are inputs of the hidden layer.
     """
 
     filters: int

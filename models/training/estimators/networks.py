@@ -129,8 +129,9 @@ def train_network(
 ) -> nn.Sequential:
     """Train a network on inputs (N, *shape) and labels (N,); return it in evaluation mode.
 
-    The same arguments give the same weights on the same machine. Each epoch sees the grasps once,
-    shuffled. Raises `ValueError` for fewer than two grasps.
+    The same arguments give the same weights on the same machine. Each epoch sees each
+    grasp at most once, shuffled; a short last batch may be left out. Raises `ValueError` for fewer
+    than two grasps.
     """
     if len(inputs) < 2:
         raise ValueError(f"cannot train on {len(inputs)} grasps")
@@ -255,7 +256,7 @@ def _fit(
 
 
 def _batches(grasps: int, recipe: AnyRecipe) -> Sequence[slice]:
-    """Return the slices of an epoch's shuffled order, one per batch."""
+    """Return an epoch's slices of the shuffled order, one per batch, the last if long enough."""
     batch = min(recipe.batch, grasps)
     # A batch norm cannot be trained on a single grasp. Keras uses any larger remainder.
     least = batch if isinstance(recipe, Recipe) else 2

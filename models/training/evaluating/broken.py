@@ -29,7 +29,7 @@ KINDS: dict[str, Breakage] = {
     "anywhere": lambda counts, random: random.integers(200, 3500, counts.shape).astype(np.uint16),
     "500 too high": lambda counts, _: np.minimum(counts + 500, COUNT_MAX - 1).astype(np.uint16),
 }
-"""Values of a broken electrode, by kind of damage."""
+"""Functions of counts (and a generator) to the counts of broken electrodes, by kind of damage."""
 
 
 def broken_study(system: System, grasps: Grasps, seed: int) -> dict[str, Any]:
@@ -37,11 +37,11 @@ def broken_study(system: System, grasps: Grasps, seed: int) -> dict[str, Any]:
 
     `grasps` have only the system's fingers. Raises `TooFewGraspsError`.
 
-    Returns F1, 0..1, slip positive: `sound` and, after false repairs, `sound_repaired`;
-    `false_alarms`, the fraction of sound readings with such a repair; and of `broken` ones, with
-    `number` electrodes broken at random places in a way of `KINDS` (`reads`): F1 `unnoticed`, with
-    all of them `known` and repaired, with those repaired that were `found` by their values, and
-    the fraction of the electrodes that was `detected` so.
+    Returns F1 (0..1, slip positive) `sound`, and after false repairs `sound_repaired`;
+    `false_alarms`, the fraction of sound readings with such a repair; `grasps`, their number; and a
+    list, `broken`, with a dict for each of `KINDS` (`reads`) and each `number` of electrodes broken
+    at random places: F1 `unnoticed`, F1 with all of them repaired (`known`), F1 with those repaired
+    that their values show (`found`), and the fraction of the broken ones so shown (`detected`).
     """
     folds = [
         _Fold(system, grasps, out, fold_seed(seed, fold))

@@ -25,7 +25,7 @@ def verdicts(
     refused: Bools | None = None,
     ages: Ints | None = None,
 ) -> pd.DataFrame:
-    """Return the verdicts of a variant on these rows of grasps, with columns of `frame.judged`.
+    """Return a variant's verdicts on these rows of grasps: the first 5 columns of `frame.judged`.
 
     `refused` None: not known; `ages` None: there is no running session.
     """

@@ -137,19 +137,19 @@ def with_probability(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def temperature(rows: pd.DataFrame) -> float:
-    """Return the temperature fitted to all margins together."""
+    """Return the temperature fitted to the margins of all these rows together."""
     return metrics.fit_temperature(rows["margin"].to_numpy(), rows["slipped"].to_numpy())
 
 
 def right(rows: pd.DataFrame) -> pd.Series:
-    """Return True for each right verdict."""
+    """Return for each row True if its verdict is right."""
     return (rows["margin"] > 0.0) == rows["slipped"]
 
 
 def by_age(rows: pd.DataFrame) -> dict[int, pd.DataFrame]:
     """Return the rows of a running variant by the age of its session, the youngest first.
 
-    A key is the lowest age of its rows, one of `AGES`; the next one is their end.
+    A key is one of `AGES`: its rows are of sessions from this age to below the next of `AGES`.
     """
     group_of = np.searchsorted(AGES, rows["age"].to_numpy(np.int64), side="right") - 1
     return {AGES[group]: part for group, part in rows.groupby(group_of)}
@@ -158,9 +158,9 @@ def by_age(rows: pd.DataFrame) -> dict[int, pd.DataFrame]:
 def by_day(rows: pd.DataFrame) -> dict[str, dict[str, Any]]:
     """Return the figures of a variant of `days` by group of streams.
 
-    `every`: figures of all grasps, also of those that the daemon would refuse; `judged`: of the
-    rest; `coverage`: fraction of the rest; `refused_slipped`: fraction of slips among the refused;
-    None: no refused.
+    `every`: `verdict_figures` of all grasps, also of those that the daemon would refuse; `judged`:
+    of the rest; `coverage`: the rest as a fraction of all; `refused_slipped`: fraction of slips
+    among the refused; None: no refused.
     """
     streams = rows["fold_name"].str[0] + " " + rows["table"]
     made = {}

@@ -103,7 +103,8 @@ def judged(job: Job, grasps: Grasps) -> pd.DataFrame:
 def _judged_at_once(
     trained: Trained, grasps: Grasps, split: Split, seed: int
 ) -> Iterator[pd.DataFrame]:
-    """Judge the test grasps of a split, in several variants if they are of a later session."""
+    """Judge the test grasps of a split; a session system judges those of a later session in all
+    `SESSION_VARIANTS`."""
     test, kind, standards = split.test, trained.system.input, trained.standards
     if split.calibration is None or standards is None or not isinstance(kind, SessionFeatures):
         variant = Variant.NONE if standards is None else Variant.TRAINING

@@ -52,10 +52,11 @@ class Spread:
 
 
 def score(margins: Floats, slipped: Bools, probability: Floats) -> dict[str, float]:
-    """Return figures of margins and slip probabilities against labels (N,), slip positive.
+    """Return scores of margins and slip probabilities against labels, each (N,), slip positive.
 
-    `auc` is NaN for a single class. `ece` is the expected calibration error of the verdict's
-    probability, `brier` the mean squared error of the slip probability.
+    Margins give `accuracy`, `precision`, `recall`, `f1`, `auc` (NaN for a single class);
+    probabilities give `brier`, their mean squared error; `log_loss`; `ece`, the expected
+    calibration error of the verdict's probability.
     """
     verdict = margins > 0.0
     precision, recall, f1, _ = precision_recall_fscore_support(
@@ -105,8 +106,8 @@ def fit_temperature(margins: Floats, slipped: Bools) -> float:
 def cross_fitted(rows: pd.DataFrame) -> pd.Series:
     """Return the slip probability of each row; `rows` are of one seed and variant.
 
-    Each fold is calibrated by the other folds' temperature; in a single fold, each object by
-    others.
+    Each fold is calibrated by a temperature fitted to the other folds; of a single fold, each
+    object by one fitted to the other objects.
     """
     group_of = rows["fold"] if rows["fold"].nunique() > 1 else rows["object"]
     probability = pd.Series(np.nan, rows.index)
@@ -166,7 +167,8 @@ def confusion(rows: pd.DataFrame) -> Ints:
 
 
 def verdict_figures(rows: pd.DataFrame) -> dict[str, float | None]:
-    """Return number of grasps and scores of verdicts, slip positive; None: a share of no grasp."""
+    """Return `grasps`, their number; `f1`, slip positive, 0..1; and shares: `slips_among_stable`,
+    `slips_called_stable`, `stable_called_slip`; None: a share of no grasp."""
     (held, alarms), (missed, found) = confusion(rows).tolist()
     return {
         "grasps": len(rows),
@@ -182,7 +184,8 @@ def _share(some: int, of: int) -> float | None:
 
 
 def by_confidence(probability: pd.Series, slipped: pd.Series) -> pd.DataFrame:
-    """Return a table: `accuracy` and `coverage` of verdicts from each `confidence` on, falling.
+    """Return a row for each `confidence`, falling: `accuracy` of the verdicts that have it or more,
+    and their share of all, `coverage`.
 
     Verdicts of equal confidence count together.
     """
@@ -201,7 +204,7 @@ def by_confidence(probability: pd.Series, slipped: pd.Series) -> pd.DataFrame:
 def coverage_curve(
     probability: pd.Series, slipped: pd.Series, steps: int = CURVE_STEPS
 ) -> list[ConfidenceStep]:
-    """Return the accuracy of the most confident verdicts, ascending in coverage up to all."""
+    """Return at most `steps` points of `by_confidence`, ascending in coverage up to 1."""
     points, number = by_confidence(probability, slipped), len(slipped)
     wanted = np.unique(np.ceil(np.linspace(1.0 / steps, 1.0, steps) * number))
     ends = np.rint(points["coverage"] * number)

@@ -81,7 +81,7 @@ def to_svg(figure: Figure, title: str, figures: Sequence[str]) -> str:
 
 
 def _with_classes(found: re.Match[str]) -> str:
-    """Replace the palette's colours in a `style` attribute by classes."""
+    """Return a `style` attribute with the palette's colours replaced by CSS classes."""
     classes = [
         f"{kind[0]}{colour[1:]}" for kind, colour in _COLOUR.findall(found[1]) if colour in DARK
     ]

@@ -43,7 +43,10 @@ RANDOM_READINGS = 10_000
 
 
 def seen_counts(counts: Numbers, margin: int = MARGIN_COUNTS) -> SeenCounts:
-    """Return the description of counts (N, fingers, 24). Raises `ValueError` for N < 2."""
+    """Return the description of counts (N, fingers, 24). Raises `ValueError` for N < 2.
+
+    `margin`: counts beyond their range that still pass as seen.
+    """
     if len(counts) < 2:
         raise ValueError("two readings at least have a covariance")
     flat = counts.reshape(len(counts), -1).astype(np.float64)

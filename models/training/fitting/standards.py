@@ -82,7 +82,10 @@ class TrainingStandards:
         return cls(tables, Standards(features.mean(axis=0), spread))
 
     def each(self, table_of: Ints) -> Standards:
-        """Return each grasp's standards by its table (N,), shape (N, M). Raises `KeyError`."""
+        """Return each grasp's standards by its table (N,), shape (N, M).
+
+        Raises `KeyError` for a table without training rows.
+        """
         standards = [self.tables[int(table)] for table in table_of]
         return Standards(
             np.stack([one.mean for one in standards]), np.stack([one.spread for one in standards])

@@ -41,7 +41,7 @@ from graspd.models.training.systems.registry import BlendConfig, SessionFeatures
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trained:
-    """A system with its training data."""
+    """A trained system: `fitted`, and the `grasps` that it was trained on."""
 
     system: System
     fitted: Fitted

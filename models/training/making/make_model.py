@@ -161,7 +161,10 @@ def _measured(one: Figures) -> MeasuredError:
 
 
 def _sharpness(measured: list[Figures]) -> tuple[Sharpness, ...]:
-    """Return a session's temperatures by age, over the model's own: 1 or more, never rising."""
+    """Return a session's temperatures by age, divided by the model's own: 1 or more, never rising.
+
+    A single one, 1, if no running session was measured on other days.
+    """
     base = temperature(_calibrator(measured).of_variant())
     later = next((one for one in measured if one.protocol == "days"), None)
     if later is None or Variant.RUNNING not in later.variants:
@@ -206,7 +209,7 @@ def _data_sources(files: Sequence[Dataset]) -> dict[str, object]:
 def _card_figures(one: Figures) -> dict[str, object]:
     """Return the figures of a protocol that a user of the model needs, slip positive.
 
-    `calibrated_by`: F1 by variant of session calibration; empty where no session is left out.
+    `calibrated_by`: F1 by variant of session calibration; empty if there is one variant.
     """
     rows = one.of_variant()
     several = one.variants if len(one.variants) > 1 else []

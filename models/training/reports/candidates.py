@@ -35,7 +35,7 @@ PERIOD_S = 0.01
 QUANTILES = {"p50": 0.5, "p99": 0.99, "p99.9": 0.999}
 
 Row = dict[str, Any]
-"""One candidate of a report: `name`, `kind` (`model` or `peer`), `fingers`, `error`, `time`."""
+"""One candidate: `name`, `kind` (`model` or `peer`), `fingers`, `error` by protocol, `time`."""
 Step = Callable[[int], object]
 """Function that does the timed work for the reading with this number."""
 Times = dict[str, float]
@@ -79,7 +79,7 @@ def _model(model: TactileModel, grasps: Grasps) -> Candidate:
 
 
 def errors(figures: dict[str, Any]) -> dict[str, float]:
-    """Return scores, 0..1, from a protocol's figures in a card.
+    """Return `f1`, `accuracy`, `brier` and `ece`, 0..1, from a protocol's figures in a card.
 
     `low` to `high` is the 95 % interval of `f1` (Nadeau and Bengio)."""
     spreads, folds = figures["spreads"], figures["folds"]
@@ -148,7 +148,7 @@ def _published(counts: NDArray[np.uint16]) -> Step:
 
 
 def measure(steps: Mapping[str, Step], readings: int, paced: int) -> dict[str, Times]:
-    """Time each step on `readings` readings without pause (hot), and on `paced` at 100 Hz."""
+    """Return times of each step: of `readings` without pause (hot), and of `paced` at 100 Hz."""
     for step in steps.values():
         for index in range(WARM_UP):
             step(index)

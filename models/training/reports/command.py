@@ -11,7 +11,7 @@ from graspd.models.training.data.datasets import DatasetError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the reports and their arguments; what measures takes seconds to load."""
+    """Declare the reports and their arguments, without loading them, which takes seconds."""
     reports = parser.add_subparsers(
         dest="report", metavar="WHAT", required=True, help="what to measure"
     )

@@ -34,7 +34,7 @@ from graspd.models.training.reports.machine import described, machine
 
 RUNS = 3
 READINGS, PACED = 2000, 300
-"""Readings of each candidate in a run."""
+"""Readings of each candidate in a run: without pause, and at 100 Hz."""
 QUICK_READINGS, QUICK_PACED = 100, 5
 COLUMNS = (
     "model",
@@ -77,7 +77,7 @@ TITLE_PT, FONT_PT = 9.5, 8.5
 MARKER_PT = 6.5
 
 Report = dict[str, Any]
-"""Figures in `error-vs-time.json`."""
+"""Content of `error-vs-time.json`: `machine`, `quick`, numbers of `readings`, `rows`."""
 
 
 def run(args: argparse.Namespace) -> int:
@@ -121,7 +121,7 @@ def report(grasps: Grasps, *, quick: bool) -> Report:
 
 
 def _over_runs(runs: Sequence[Times]) -> Row:
-    """Return the median of each time, and its lowest and highest run."""
+    """Return `time`, the median of each time, and `time_of_runs`, its lowest and highest run."""
     several = {name: [run[name] for run in runs] for name in runs[0]}
     return {
         "time": {name: statistics.median(values) for name, values in several.items()},
@@ -130,7 +130,7 @@ def _over_runs(runs: Sequence[Times]) -> Row:
 
 
 def _rank(row: Row) -> tuple[str, float]:
-    """Return a sort key: models before peers, and those with the smallest error first."""
+    """Return a sort key: models before peers, and those with the best F1 on known objects first."""
     return row["kind"], -error_of(row, PANELS[0][0]).get("f1", 0.0)
 
 
@@ -140,8 +140,8 @@ def table(measured: Report) -> list[str]:
 
 
 def page_table(measured: Report) -> list[str]:
-    """Return the table for a page: candidates for the whole hand, the fastest first, without hot
-    times and intervals."""
+    """Return the table for a page, with the columns `ON_PAGE`: candidates for the whole hand, the
+    fastest first, F1 without intervals."""
     rows = []
     for row in whole_hand(measured["rows"]):
         cells = _cells(row)
@@ -205,7 +205,7 @@ def whole_hand(rows: Sequence[Row]) -> list[Row]:
 
 
 def draw(report: Report, figures: Sequence[str]) -> str:
-    """Return the picture, as SVG; `figures` are the report's table."""
+    """Return the picture, as SVG; `figures`: lines of the report's table, for its description."""
     rows = whole_hand(report["rows"])
     with style():
         figure = Figure(figsize=SIZE_IN, dpi=72, layout="constrained")

@@ -65,7 +65,8 @@ def reliability(learning: pd.DataFrame, scales: dict[tuple[int, int], float]) ->
     """Return the calibration of `p_slip` in rows of `live`, which had these scales.
 
     `parts`: for grasps with a `p_slip` from `low` to `high`, its mean (`said`) and the share that
-    `slipped`. `slope`: of all grasps. `sessions`: slopes of single sessions at `SPREAD`.
+    `slipped`. `slope`: of all grasps. `sessions`: quantiles `SPREAD` of single sessions' slopes.
+    `shipped`: the learner's own scale.
     """
     rows = after_outcomes(learning)
     parts = [

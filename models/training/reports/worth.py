@@ -44,7 +44,7 @@ from graspd.models.zoo import read_card
 ALLOWED: Final = 0.05
 TARGETS: Final = (0.02, ALLOWED, 0.1, 0.2)
 WARM_UP, EXPLORE = 50, 0.05
-"""Defaults of the scene's `[risk]`."""
+"""Defaults of `warm_up`, outcomes, and `explore`, a share, in the scene's `[risk]`."""
 WARM_UPS: Final = (0, 20, WARM_UP, 100)
 """Lengths of the warm-up that are compared, outcomes."""
 ALL_DAYS: Final = "all"
@@ -139,12 +139,15 @@ def worth_of(several: Sequence[Stream], command: str) -> Figures:
 
 
 def limits(share: float, warm_up: int = WARM_UP) -> RiskLimits:
-    """Return the limits of a scene that sets this share and this warm-up."""
+    """Return the limits of a scene that allows this share of slips, with this warm-up, outcomes."""
     return RiskLimits(share, warm_up, EXPLORE)
 
 
 def measured(learning: pd.DataFrame, risk: pd.DataFrame) -> Curves:
-    """Return how often grasps were called `stable`, and how often these slipped, in all streams."""
+    """Return each method's `slips_among_stable` and `coverage` by part of the day, all streams.
+
+    `learning`, `risk`: rows of `live` without and with a risk target.
+    """
     said = {
         PUBLISHED: learning["published"] < 0.0,
         ALONE: (learning["margin"] < 0.0) & ~learning["refused"],

@@ -73,7 +73,7 @@ Estimator = NetworkConfig | ClassicalConfig | BlendConfig
 
 @dataclass(frozen=True, slots=True)
 class PaperFigure:
-    """A figure of the paper, %, slip positive: mean and standard deviation."""
+    """Scores in the paper, %, slip positive: mean and standard deviation; None: not given."""
 
     place: str
     """Table, figure or section of the paper (arXiv:1809.05551), and the row."""
@@ -98,12 +98,12 @@ class System:
     """True: the model standardises each input value by its training mean and spread."""
     fingers: tuple[Finger, ...] = TABLE_FINGERS
     tables: tuple[str, ...] = WHOLE
-    """Training tables of the kept model; protocols have their own."""
+    """Tables that a final model is trained on; protocols have their own."""
     published: tuple[PaperFigure, ...] = ()
 
 
 def digest(system: System) -> str:
-    """Return the SHA-256 of the system's configuration without name, fingers and tables."""
+    """Return the SHA-256 of the system's configuration without name and tables."""
     parts = configuration(system, "input", "estimator", "recipe", "augmentation", "standardise")
     text = json.dumps(parts, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()

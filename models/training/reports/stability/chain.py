@@ -149,10 +149,10 @@ class Comparison:
         p_slip: NDArray[np.float64],
         judged: list[tuple[Opinion, NDArray[np.float32]]],
     ) -> dict[str, float]:
-        """Return errors of `p_slip`, and numbers of verdicts that flip beyond the bound.
+        """Return the largest errors of `p_slip`, and `flips`: verdicts that flip beyond the bound.
 
         `network`: error of the network alone, with the same float32 input. `p_slip`: from the
-        counts on.
+        counts on. Empty without a reference.
         """
         reference = self._reference
         if reference is None:

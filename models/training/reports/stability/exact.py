@@ -94,7 +94,7 @@ def exact_input(
     """Return inputs (N, *shape) and spreads (N, fingers) of counts (N, fingers, 24).
 
     Features are standardised by `standard`, mean and spread (features,), or by the training's.
-    The part of a flat finger is zero.
+    Z-values and pixels of a flat finger are zero.
     """
     values = counts.astype(np.longdouble)
     match contract.input:

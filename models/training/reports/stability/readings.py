@@ -21,7 +21,7 @@ Counts = NDArray[np.generic]
 
 
 def likely_grasps(seen: SeenCounts, seed: int = 0) -> Raw:
-    """Return counts (N, fingers, 24) drawn from the mean and covariance of a model's training."""
+    """Return `RANDOM_READINGS` grasps drawn from the mean and covariance of a model's training."""
     centre = np.array(seen.centre)
     normal = np.random.default_rng(seed).normal(size=(RANDOM_READINGS, centre.size))
     # The covariance is inv(L @ L.T), so inv(L).T gives normal numbers that covariance.
@@ -80,14 +80,14 @@ def all_at(level: int) -> Callable[[Raw], Counts]:
 
 
 def alternating(likely: Raw) -> Counts:
-    """Return readings with the electrodes at the two rails in turns."""
+    """Return readings with the electrodes at 0 and 4095 in turns."""
     counts = np.zeros_like(likely[:2])
     counts[0, :, ::2] = counts[1, :, 1::2] = COUNT_MAX
     return counts
 
 
 def one_at_a_rail(likely: Raw) -> Counts:
-    """Return readings with one electrode, each in turn, at each rail."""
+    """Return readings with one electrode of the first finger, each in turn, at 0 and at 4095."""
     counts = likely[: 2 * ELECTRODES].copy()
     for electrode in range(ELECTRODES):
         counts[2 * electrode : 2 * electrode + 2, 0, electrode] = (0, COUNT_MAX)

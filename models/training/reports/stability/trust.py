@@ -153,10 +153,10 @@ def learner_row(outcomes: int) -> Row:
 
 
 def beyond_the_bound(alpha: float, late: int, slips_from: float) -> float:
-    """Return the most slips beyond the bound, by an adversary that knows the rule and its budget.
+    """Return by how many slips an adversary that knows the rule and its budget exceeds the bound.
 
-    It lifts the surest grasps, which hold until the budget is at `slips_from` and slip from then
-    on. Outcomes come `late` at a time.
+    It lifts the surest grasps, which hold until the budget is at `slips_from` slips, and slip from
+    then on. Outcomes come `late` at a time. `alpha`: allowed share of slips.
     """
     rule, worst, waiting = Risk(RiskLimits(alpha)), -math.inf, list[bool]()
     for _ in range(LIFTS):

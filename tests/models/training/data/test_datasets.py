@@ -108,7 +108,7 @@ def made_up(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_some_rows_keep_counts_labels_objects_and_tables_together(made_up: Path) -> None:
+def test_selected_rows_keep_their_counts_labels_and_tables(made_up: Path) -> None:
     whole = read_all(made_up)
     assert unpublished(whole.files) == ["palm_down", "palm_side"]
     some = whole.rows(np.array([1, 5, 7]))

@@ -1,4 +1,4 @@
-"""Trainings are pure, kept and never run twice, and a session is judged in several ways."""
+"""Trainings are pure, kept and never run twice, and a session is judged in several variants."""
 
 from __future__ import annotations
 
@@ -160,7 +160,7 @@ def test_a_dask_cluster_gives_the_same_rows_as_this_computer(tmp_path: Path) -> 
     assert all(same(found[job], here[job]) for job in JOBS)
 
 
-def test_a_killed_worker_raises_lost_worker_error() -> None:
+def test_joblibs_error_on_a_killed_worker_becomes_lost_worker_error() -> None:
     with pytest.raises(LostWorkerError, match="a process was killed"), processes(1):
         raise TerminatedWorkerError
 

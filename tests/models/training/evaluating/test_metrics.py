@@ -26,7 +26,7 @@ PROBABILITY = pd.Series([0.99, 0.05, 0.90, 0.80, 0.30, 0.60])
 SLIPPED = pd.Series([True, False, False, True, True, True])
 
 
-def test_spread_over_folds_and_error_over_seeds() -> None:
+def test_spread_is_over_folds_and_error_over_seeds() -> None:
     result = over_seeds(np.array([[0.8, 1.0], [0.6, 0.8]]))
     # Fold means 0.9 and 0.7; each seed's folds lie 0.1 off their mean; error 0.1 * sqrt(2/2).
     assert result.mean == pytest.approx(0.8)
@@ -122,7 +122,7 @@ def test_the_temperature_of_separable_labels_ends_at_a_bound(sign: float, end: f
     assert fit_temperature(margins, slipped) == pytest.approx(end)
 
 
-def test_the_calibration_error_is_the_one_by_hand() -> None:
+def test_the_expected_calibration_error_equals_hand_calculation() -> None:
     probability = np.array([0.9, 0.9, 0.1, 0.62])
     # Confidence 0.9 three times, of which two are right: gap 3 * 0.9 - 2 = 0.7; then 1 - 0.62.
     result = score(probability - 0.5, np.array([True, False, False, True]), probability)

@@ -129,7 +129,7 @@ def test_written_figures_are_read_and_foreign_files_left_out(
 
 
 def rows(text: str, section: int) -> list[list[str]]:
-    """Cells of the table's rows in a numbered section."""
+    """Cells of the table's rows in the section with this number of the page `text`."""
     part = text.split("\n## ")[section]
     lines = [line for line in part.splitlines() if line.startswith("| ") and "| --- |" not in line]
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]

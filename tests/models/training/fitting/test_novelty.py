@@ -36,7 +36,7 @@ def test_seen_counts_are_range_mean_and_inverse_covariance() -> None:
     np.testing.assert_allclose(lower @ lower.T @ covariance, np.eye(72), atol=1e-5)
 
 
-def test_a_held_out_fold_does_not_widen_its_range() -> None:
+def test_readings_only_in_the_held_out_group_are_refused() -> None:
     counts = random_counts(100)
     counts[:2, 0, 0] = 3500
     group_of = np.arange(100) // 50
@@ -45,7 +45,7 @@ def test_a_held_out_fold_does_not_widen_its_range() -> None:
     assert Electrodes(seen_counts(counts)).never_seen(counts)[:2].tolist() == [False, False]
 
 
-def test_made_up_readings_are_refused() -> None:
+def test_all_but_one_kind_of_made_up_readings_are_refused() -> None:
     counts = random_counts(500)
     fractions = made_up_never_seen(counts, seen_counts(counts), seed=1)
     assert len(fractions) == 4

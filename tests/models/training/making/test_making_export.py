@@ -135,7 +135,7 @@ def test_the_file_judges_unseen_grasps_as_the_trainer(name: str, tmp_path: Path)
 
 
 @pytest.mark.parametrize("name", ["session network", "svm", "forest", "boosting"])
-def test_the_same_training_makes_the_same_bytes_anywhere(name: str, tmp_path: Path) -> None:
+def test_equal_trainings_make_equal_bytes_without_local_paths(name: str, tmp_path: Path) -> None:
     contract = contract_of(name)
     files = [tmp_path / "once.onnx", tmp_path / "again.onnx"]
     for path, made in zip(files, (fitted(name), trained(name)), strict=True):
