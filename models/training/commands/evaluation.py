@@ -64,7 +64,7 @@ VERDICTS = "verdicts"
 
 
 def evaluate(args: argparse.Namespace) -> None:
-    """Evaluate as the command line says. Raises the errors that `exit_code` handles."""
+    """Evaluate as the command line says. Raises what `exit_code` handles, and `ModelError`."""
     systems = _systems(args.names)
     if args.train or args.test or args.model:
         epochs = QUICK_EPOCHS if args.quick else None
