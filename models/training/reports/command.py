@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Make the report; return its exit code, 2 for wrong input, data, folder. Raises `ModelError`."""
+    """Make the report; return its exit code, 2 for wrong input or folder. Raises `ModelError`."""
     try:
         code: int = importlib.import_module(REPORTS[args.report][0]).run(args)
     except (DatasetError, OSError, WrongInputError) as error:
