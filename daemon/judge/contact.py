@@ -55,7 +55,7 @@ Electrodes of one finger drift apart by 0.2 counts/s (measured on three sensors)
 the drift is more than half of `TOUCH_COUNTS`.
 """
 ALONE_NS = 30_000_000_000
-"""Longest touch while another finger does not touch, ns: no grasp; then it is tared again."""
+"""Longest touch while another finger does not touch, ns; after it the tare is forgotten."""
 SUSPECT = 0.5
 """A sweep with a fall above this share of a touch's threshold is not used for the tare."""
 SIGMA_MIN_COUNTS = 1.5
@@ -190,7 +190,7 @@ class Window:
         self.number += 1
 
     def rests(self, fingers: Sequence[int]) -> Iterator[Rest | None]:
-        """Yield the tare of each of these rows; None: it moved, or has too few sound electrodes.
+        """Yield the tare of each of `fingers` (rows); None: it moved, or few electrodes are sound.
 
         Call it after at least `WINDOW` sweeps.
         """
@@ -291,8 +291,8 @@ class Contact:
     def _falls(
         self, median: NDArray[np.uint16], usable: NDArray[np.bool_] | None
     ) -> tuple[NDArray[np.float64], list[int]]:
-        """Return each finger's falls, ascending, and how many of them are of usable electrodes.
-        Falls of other electrodes are infinite, so they come last."""
+        """Return each finger's falls below its baseline, ascending, shape (fingers, 24), and how
+        many are of usable electrodes. The others are infinite, so they come last."""
         falls, numbers = median.astype(np.float64), self._known
         np.subtract(self.baseline, falls, out=falls)
         if usable is not None:

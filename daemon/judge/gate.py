@@ -31,8 +31,8 @@ that, even with slow readings of which one is lost."""
 STANDS_NS = 100_000_000
 """Largest age of a verdict, ns. After it, even a reading without new values is judged."""
 CHANGE_COUNTS = 40.0
-"""Largest mean change of a finger's electrodes since the first judgement, counts. Above it the
-grasp is a different one, and must settle again."""
+"""Largest mean change of a finger's electrodes since the first judgement after settling, counts.
+Above it the grasp must settle again."""
 RELEASE_NS = 100_000_000
 """How long the gate stays in `released` before `idle`, ns."""
 JUST_SHORT_NS = LONG_NS - 1_000_000
@@ -136,10 +136,9 @@ class Question:
         return age_ns > STANDS_NS or (fresh and (self.asked or age_ns >= REFRESH_NS))
 
     def answer(self, t_ns: int, *, first: bool) -> bool:
-        """Note a judgement at `t_ns`. Return True if it is the grasp's `first` or answers a
-        question.
+        """Note a judgement at `t_ns`, the `first` after settling or a later one.
 
-        It is False if the judgement is a periodic refresh.
+        Return True for the first, and with `on_request` if it answers a question; else False.
         """
         answers = first or (self.asked and self._on_request)
         self._judged_ns, self.asked = t_ns, False
@@ -164,7 +163,7 @@ class Gate:
         self.phase, self._still = Phase(), Stillness()
         self._question = Question(limits.on_request, limits.gate.request_ns)
         self._reference = np.zeros((len(fingers), ELECTRODES), dtype=np.float32)
-        """Counts at the first judgement of the grasp, shape (fingers, 24); meaningless before."""
+        """Counts at the first judgement after settling, shape (fingers, 24); meaningless before."""
         self._last_ns: int | None = None
         """Time of the last reading."""
         self._opened_ns = 0
@@ -310,7 +309,8 @@ class Gate:
         usable: NDArray[np.bool_] | None,
         limits: MotionLimits,
     ) -> tuple[Reason, ...]:
-        """Leave `judged` if the grasp has changed; return reasons to withhold the verdict now."""
+        """Leave `judged` if one of its transitions is due; return further reasons against a
+        verdict now: `MOVING` if only the slow motion is too large."""
         still = self._still
         if not still.touches:
             self._go(ways.LET_GO, t_ns)

@@ -46,7 +46,7 @@ A finger that touches moves many electrodes. In a table each reading is another 
 all differ.
 """
 JUMPS_MAX = 2.0
-"""Most recent jumps of a sound electrode. More jumps in about ten readings are a loose contact."""
+"""Largest number of recent jumps, faded, of a sound electrode; more are a loose contact."""
 JUMPS_FADE = 0.9
 """Factor by which earlier jumps count less with each reading."""
 JUMPS_FORGOTTEN = 1e-9
@@ -95,7 +95,7 @@ class Health:
         self._changed = np.zeros(shape, dtype=np.int64)
         """Number of the reading in which the count of each electrode changed last."""
         self._jumps = np.zeros(shape)
-        """Recent jumps of each electrode; earlier ones count less."""
+        """Number of jumps of each electrode, each weighted by `JUMPS_FADE` per reading since."""
         self._has_jumped = False
         """True if `_jumps` is not all zero."""
         self._faults = np.zeros(shape, dtype=np.uint8)
@@ -216,7 +216,7 @@ class Health:
 
 
 def at_rail(counts: NDArray[np.uint16]) -> NDArray[np.bool_]:
-    """Return True for counts of 0 or 4095, in the shape of `counts`; they mean nothing."""
+    """Return True for counts of 0, or of 4095 and more, in the shape of `counts`."""
     # One less than 0 is 65535: both rails are on the same side.
     railed: NDArray[np.bool_] = counts - np.uint16(1) >= np.uint16(COUNT_MAX - 1)
     return railed

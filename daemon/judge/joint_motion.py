@@ -29,7 +29,7 @@ ANGLES = 16
 LOST_MAX = 64
 """Most names of lost joints that are remembered; a hand has 24 joints."""
 SOURCES_MAX = 8
-"""Most sets of joints that are followed separately, such as those of one finger."""
+"""Most sets of joints, such as those of one finger, that are followed; one more clears them."""
 
 
 class JointMotion:

@@ -81,7 +81,7 @@ class MotionLimits:
         slow: Sequence[float] = (),
         slow_noise: SlowNoise | None = None,
     ) -> None:
-        """Set the limits by each finger's noise, and `early` and `sure` by its motion.
+        """Set the limits by each finger's noise; `early`, `sure`: whether all motion is within.
 
         `fast`, `slow`: motion in units of noise. `fast_noise`: mean absolute slopes that noise
         makes, counts/s. `slow_noise`: None before the long window is full.

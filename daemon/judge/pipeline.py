@@ -161,10 +161,10 @@ class Pipeline:
         self._late = judged
 
     def sensors_exchanged(self, known: Exchanged | None = None) -> None:
-        """Forget session, grasp and maybe the tare: the sensors were exchanged.
+        """Forget session, grasp, learning and, unless `known.tared`, the tare: new sensors.
 
-        `known`: what is known of the new sensors; None: nothing. Raises `ValueError` if it is of
-        another model.
+        From then on nothing is judged before the session is calibrated. `known`: what is known of
+        the new sensors, to start from; None: nothing. Raises `ValueError` if of another model.
         """
         if known is None:
             # A scene that keeps no session never needs it.
@@ -188,7 +188,7 @@ class Pipeline:
             self.on_exchange(known)
 
     def outcome(self, grasp: GraspId, *, slipped: bool) -> OutcomeStatus:
-        """Note how the lift of a grasp ended; return what came of it. Takes 0.5 to 1 ms."""
+        """Note how the lift of a grasp ended; return whether it is taken. Takes 0.5 to 1 ms."""
         if self.trust is not None:
             return self.trust.outcome(grasp, slipped=slipped)
         return self.lifts.tell(grasp, slipped=slipped)[0]
@@ -246,8 +246,8 @@ class Pipeline:
         return self._conclude(last_t_ns, 0, (Reason.STALE,), lift, moment, NO_OPINION, worth, risk)
 
     def health(self) -> dict[str, Reason]:
-        """Return the current problems: of electrodes such as `ff_7`, fingers, joints, model,
-        session."""
+        """Return the reason of each part that has a problem, by its name: of an electrode, such as
+        `ff_7`, a finger, `joints`, `model` or `session`."""
         findings = dict.fromkeys(self._opinion.repaired, Reason.ELECTRODE_IMPLAUSIBLE)
         for (finger, place), reason in self._health.electrodes().items():
             findings[electrode_name(self._fingers[finger], place)] = reason
@@ -280,8 +280,12 @@ class Pipeline:
     def _assess(
         self, grasp: GraspId, opinion: Opinion
     ) -> tuple[Assessment | None, RiskOutcomes | None]:
-        """Return the assessment of the grasp by the outcomes known now, and these outcomes.
-        `opinion`: the network's answer to this reading."""
+        """Return the assessment of the grasp by the outcomes known now, and those of `stable`
+        lifts; None, None: no learning and no risk.
+
+        `opinion`: the network's answer to this reading. If it cannot be assessed, it counts as
+        `MODEL_FAILED`.
+        """
         if self.trust is None:
             return None, None
         features = self._judge.features
@@ -312,10 +316,11 @@ class Pipeline:
         risk: RiskOutcomes | None,
         counts: NDArray[np.uint16] | None = None,
     ) -> Judgement:
-        """Return the judgement of a reading; `unusable` has the reasons against using it.
+        """Return the judgement of a reading that ended at `t_ns` and was made at `made_ns`.
 
-        `worth`: assessment of the grasp; None: the network's opinion stands. A judgement that is
-        not `stable` is kept as `HoldDown` of later ones.
+        `unusable`: reasons against using it. `lift`: name of the grasp. `worth`: its assessment;
+        None: the network's opinion stands. `counts`: `judged_counts`. A judgement that is not
+        `stable` is kept as `HoldDown` of later ones.
         """
         calibrated = None if self.session is None else self.session.calibrated
         objections = unusable

@@ -104,7 +104,7 @@ ADVICE: dict[Reason, str] = {
 OF_THE_HAND = frozenset(
     {Reason.NO_CONTACT, Reason.MOVING, Reason.SETTLING, Reason.NOT_TARED, Reason.NOT_ASKED}
 )
-"""Reasons of an open hand, or of a grasp that settles."""
+"""Reasons of an open hand, or of a grasp that moves, settles or waits for a request."""
 
 
 class Need(StrEnum):
@@ -154,7 +154,7 @@ UNREADABLE = frozenset(
 )
 """Reasons for which the sensors cannot be read, so that the state of the hand is not known."""
 FOLLOWING = {*NEEDS, Reason.JOINTS_LATE}
-"""Reasons that last while no readings come: until then there is nothing to do about them."""
+"""Reasons that cannot end while no readings come, so there is nothing to do about them then."""
 _ORDER = {reason: (reason in NEEDS, place) for place, reason in enumerate(Reason)}
 """Sort key of each reason: as in `Reason`, but those that are not `Need.ACT` come last."""
 WATCHED_LIFT = frozenset({Reason.LOW_CONFIDENCE, Reason.UNPROVEN})
@@ -261,7 +261,7 @@ class Moment(NamedTuple):
     judges: bool = True
     """True if the network is to judge the grasp by this reading."""
     judged: bool = True
-    """True for a grasp's first judgement or the answer to a question; False for a periodic refresh.
+    """True for the first judgement after settling and the answer to a request; False: a refresh.
 
     Without a gate it is True for each reading, sound or not.
     """

@@ -76,7 +76,7 @@ class SpikeFilter:
         self._jumped[which] = SPIKE_SWEEPS_MAX
 
     def add(self, sweep: Sweep) -> Sweep:
-        """Return the sweep without spikes."""
+        """Take in a sweep; return it with the last clean value in place of each spike."""
         jumps = self._jumps
         np.abs(np.subtract(sweep, self.clean, out=jumps), out=jumps)
         before, self._came = self._came, sweep

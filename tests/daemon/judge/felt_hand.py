@@ -262,7 +262,7 @@ few_everywhere = st.builds(
     st.integers(1, 6),
     st.integers(0, 18),
 )
-"""One to six flaws in each finger: from five on too many for a hand, but not for one finger."""
+"""One to six missing electrodes in each finger: five are too many for a hand, not for a finger."""
 feels = st.builds(
     Feel,
     pose=often(

@@ -46,8 +46,8 @@ SICK_FOR = 24
 DOUBT_FOR = 40
 """Number of readings that are not checked after one that the judge may or may not have used."""
 NEAREST, FURTHEST = 3, 5
-"""Of the last five values three are fresh, because at most every other one repeats the one before;
-of the last three, two are fresh."""
+"""Of the last 3 values at least two are fresh, of the last 5 three, because at most every other
+value repeats the one before."""
 STEP_MS, STEP_SWEEPS_MAX = 5, 10
 """Length of a step, ms, and most sweeps in it. The judge uses their mean."""
 REMEMBERED = FURTHEST + 2 * STEP_SWEEPS_MAX + 2
@@ -159,7 +159,7 @@ class Necessity:
         self._use(reading, ~broken)
 
     def lacks(self) -> list[str]:
-        """Return what a verdict on the last reading would lack; empty: nothing that is followed."""
+        """Return the unmet conditions of a verdict on the last reading, in words; empty: none."""
         lacks = [*self._unusable]
         if not lacks and not self._doubt:
             lacks += self._lacks_contact() + self._lacks_stillness() + self._lacks_joints()

@@ -106,7 +106,7 @@ def test_any_reason_makes_the_verdict_unknown(where: str) -> None:
         assert decide(0.0, health, moment, 0, LIMITS) == (Decision.UNKNOWN, (reason,))
 
 
-def test_by_default_a_reading_older_than_100_ms_is_stale() -> None:
+def test_defaults_are_slip_from_one_half_and_stale_after_100_ms() -> None:
     for p_slip, age_ns, wanted in (
         (0.499999, 100_000_000, (Decision.STABLE, ())),
         (0.5, 100_000_000, (Decision.SLIP, ())),
@@ -140,7 +140,7 @@ FF = {f"ff_biotac_{number}": "saturated" for number in range(1, 25)}
         ({**FF, "ff_biotac_2": "parity"}, {"parity": ["ff"], "saturated": ["ff"]}),
     ],
 )  # fmt: skip
-def test_parts_are_named_once_by_what_to_act_on(
+def test_parts_to_act_on_are_grouped_by_reason_without_consequences(
     health: dict[str, str], shown: dict[str, list[str]]
 ) -> None:
     found = parts_to_act_on({part: Reason(reason) for part, reason in health.items()})

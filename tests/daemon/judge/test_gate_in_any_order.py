@@ -200,8 +200,8 @@ class Readings(RuleBasedStateMachine):
 
     @rule(pressed=st.sampled_from((40, 41, -40)), is_broken=st.booleans(), is_held=st.booleans())
     def press(self, pressed: int, is_broken: bool, is_held: bool) -> None:
-        """Press one finger harder by `pressed` counts; over 40 since the first judgement make
-        another grasp. `is_broken`: half of its electrodes break. `is_held`: grasp first."""
+        """Press one finger harder by `pressed` counts; over 40 since the first judgement make the
+        grasp settle again. `is_broken`: half of its electrodes break. `is_held`: grasp first."""
         if is_held:
             self.grasp()
         self.pressed += pressed
@@ -248,7 +248,7 @@ class Readings(RuleBasedStateMachine):
 
     def follow(self, objections: tuple[Reason, ...], change: float) -> bool:
         """Update the simulation, and `against`, the reasons against judging; return True if the
-        simulated grasp has settled."""
+        simulated state is `settled`. `change`: largest mean change of a finger, counts."""
         model, felt, former = self.model, self.felt, self.model.touches
         within = felt.loose if model.sure else felt.strict
         model.now, model.touches = self.now, set(self.required) <= set(self.touching)

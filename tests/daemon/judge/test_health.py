@@ -28,7 +28,7 @@ from tests.drivers.one_sweep import tactile
 GRACE = 3
 """Number of repeated sweeps after which no verdict may be `stable`."""
 UNDER_RING = 30
-"""Number of sweeps after those; also of `stable` verdicts before packets are repeated."""
+"""Number of sweeps checked after those, and of `stable` verdicts before packets are repeated."""
 HELD = Durations(first_rest_s=(3.0, 3.0), settle_s=(4.0, 4.0))
 
 
@@ -47,7 +47,8 @@ def test_the_first_reading_is_never_counted_as_a_jump() -> None:
 
 
 def watched(steps: NDArray[np.int64]) -> list[dict[tuple[int, int], Reason]]:
-    """Return what each reading finds if finger 1 goes from 2000 by `steps`, shape (sweeps, 24).
+    """Return `Health.electrodes()` after each reading; finger 1 goes from 2000 by `steps`, shape
+    (sweeps, 24).
 
     The electrodes of the other fingers step one count more than those that keep still may.
     """
@@ -64,7 +65,8 @@ def watched(steps: NDArray[np.int64]) -> list[dict[tuple[int, int], Reason]]:
 def steps_of(sweeps: int, jumps: dict[int, int], movers: int = 1, by: int = 0) -> NDArray[np.int64]:
     """Return steps of one up and down for all electrodes, shape (sweeps, 24).
 
-    In the sweeps of `jumps` the first one makes that jump, and the next `movers` - 1 step by `by`.
+    In the sweeps of `jumps` (sweep: counts) the first electrode makes that jump, and the next
+    `movers` - 1 step by `by`.
     """
     steps = np.tile((-1) ** np.arange(sweeps)[:, None], (1, 24))
     for sweep, jump in jumps.items():
@@ -203,7 +205,7 @@ def test_cycles_of_up_to_128_sweeps_are_frozen_when_repeated(sweeps: int, live: 
 
 @pytest.mark.parametrize("packets", [15, 896])
 def test_repeating_the_same_palm_packets_is_never_stable(packets: int) -> None:
-    """Where they start again a packet is lost, or two contradict each other; that round lacks them.
+    """Where they start again a packet is lost, or two contradict each other and are left out.
 
     `packets`: number of packets that are repeated.
     """

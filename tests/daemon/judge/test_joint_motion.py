@@ -142,7 +142,7 @@ def test_eighteen_angles_a_sixteenth_of_a_window_apart_are_kept(every_ms: float,
     assert steps == {round({5: 5, 4: 8, 2.5: 5, 10: 10}[every_ms] * MS)}
 
 
-def test_joint_speed_uses_the_first_angle_of_the_window() -> None:
+def test_joint_speed_is_measured_over_the_last_80_ms() -> None:
     """By hand: 0.0079 rad in 80 ms are 0.099 rad/s, 0.0081 rad 0.101 rad/s."""
     for moved, reason in ((0.0079, None), (0.0081, Reason.MOVING)):
         motion, now_ns = turning(100.0, 0.0)

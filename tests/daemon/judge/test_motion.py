@@ -154,7 +154,7 @@ def test_at_10_hz_motion_is_known_from_the_fourth_sweep() -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [1000 / 14, 100.0, 1000.0])
-def test_motion_computed_only_at_times_equals_motion_always_computed(rate_hz: float) -> None:
+def test_motion_computed_now_and_then_equals_motion_always_computed(rate_hz: float) -> None:
     always, late = Motion(1, 0.05), Motion(1, 0.05)
     counts = np.rint(wavering(6.0, rate_hz, 4.0, 5)).astype(np.uint16)
     for index, sweep in enumerate(counts):

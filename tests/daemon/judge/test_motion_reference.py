@@ -25,7 +25,8 @@ Floats = NDArray[np.float64]
 
 @dataclass
 class Found:
-    """Motion of each finger; windows that are not full yet are infinite."""
+    """Motion of each finger by both windows, with the strict limits. `beside_limit`: that of `fast`
+    where the long window decides too."""
 
     fast: Floats
     fast_limit: Floats

@@ -68,7 +68,7 @@ def test_a_verdict_is_refreshed_although_values_keep_missing() -> None:
     assert hand.model.runs - runs >= 80 * 10 // 110
 
 
-def test_under_a_risk_repeated_judging_brings_no_lucky_stable() -> None:
+def test_with_a_risk_answers_around_its_threshold_are_never_stable() -> None:
     hand = trusting(gate_limits(), RiskLimits(0.05))
     trust = hand.pipeline.trust
     assert trust is not None
