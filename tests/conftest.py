@@ -97,7 +97,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.fixture
 def comes_first() -> Iterator[None]:
-    """Give a test priority over other work if it is itself one end of a link in real time."""
+    """Give a test that is itself one end of a link in real time priority over other processes."""
     with before_others():
         yield
 

@@ -144,7 +144,7 @@ PARAGRAPHS: Final[Mapping[str, Mapping[str, Callable[[], str]]]] = {
 
 
 def renewed(page: str) -> str:
-    """Return the text of a page with the figures of the cards."""
+    """Return the text of `page`, a path below the root, with the figures of the cards."""
     text = (ROOT / page).read_text()
     for title, rows_of in TABLES[page].items():
         titles, rows, (begin, end) = table(text, title)

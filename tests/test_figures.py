@@ -20,7 +20,7 @@ def test_the_learners_scale_is_the_one_fitted_in_the_card() -> None:
 
 
 def drawn(drawing: str, title: str) -> Rows:
-    """Return rows of the table that a picture was drawn from, which is its description."""
+    """Return the rows of the table, beginning with `title`, in deploy/`drawing`.svg."""
     return table((ROOT / "deploy" / f"{drawing}.svg").read_text(), title)[1]
 
 

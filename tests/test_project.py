@@ -18,7 +18,7 @@ from tests.bench.attacks.__main__ import ATTACKS
 
 ROOT = Path(__file__).parents[1]
 VERSION = "0.1.0"
-"""The release that the changelog begins with."""
+"""The newest release in the changelog, or the one that it announces."""
 PLACES = {
     ("CITATION.cff", r"^version: (\S+)$"): VERSION,
     ("deploy/clients/cpp/CMakeLists.txt", r"^project\(graspd_client VERSION (\S+) "): VERSION,
@@ -36,7 +36,10 @@ def found(name: str, pattern: str) -> list[str]:
 
 
 def wheel_of(project: Path, folder: Path) -> dict[str, int]:
-    """Return the checksums of the files without a version in a wheel of `project`, by name."""
+    """Build a wheel of `project` in `folder`; return the checksum of each file by its name.
+
+    METADATA and RECORD, which have the version, are left out; names have none.
+    """
     build(project, "wheel", folder)
     (wheel,) = folder.glob("*.whl")
     with zipfile.ZipFile(wheel) as content:
@@ -184,7 +187,7 @@ def test_local_links_of_pages_lead_to_existing_files_and_headings() -> None:
     assert lost == []
 
 
-def test_files_named_for_contributors_exist() -> None:
+def test_files_named_in_contributing_and_architecture_pages_exist() -> None:
     for page in (".github/CONTRIBUTING.md", "deploy/ARCHITECTURE.md"):
         named = found(page, r"[` ]((?:daemon|drivers|models|tests|deploy)/[^`\s]*)`")
         assert len(named) > 10

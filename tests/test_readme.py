@@ -70,7 +70,7 @@ def test_the_subscriber_prints_unknown_on_silence_and_old_readings(tmp_path: Pat
     assert "'seq': 1," not in heard
 
 
-def test_pages_name_the_endpoints_of_their_scenes() -> None:
+def test_readme_and_clients_page_name_only_endpoints_of_scenes() -> None:
     scenes = [scene.load(ROOT / f"deploy/{name}.toml") for name in ("scenes/demo", "clients/loop")]
     default = {"tactile": {"driver": "spi", "port": "/dev/ttyACM0"}, "ask": {}}
     scenes.append(scene.parse(default, Path("right.toml")))

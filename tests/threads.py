@@ -9,9 +9,9 @@ from contextlib import contextmanager
 
 @contextmanager
 def at_work(*tasks: Callable[[threading.Event], object]) -> Iterator[threading.Event]:
-    """Run each of `tasks` in a thread, with an event that is set at the block's end; then wait.
+    """Run each of `tasks` in a thread; yield the event with which they are called.
 
-    Yields the event.
+    At the block's end it is set, and the threads are joined.
     """
     stop = threading.Event()
     threads = [threading.Thread(target=task, args=(stop,)) for task in tasks]

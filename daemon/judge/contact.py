@@ -92,7 +92,7 @@ class Touch:
     depth: float = 0.0
     """Deepest fall of the hold, counts; it fades by `DEPTH_FADES_COUNTS_PER_S`."""
     lowest: float = 0.0
-    """Smallest fall since the finger let go, counts. The next touch is measured from it."""
+    """Smallest fall since the finger let go, counts; the next touch is `threshold` above it."""
     let_go_ns: int | None = None
     """Time of the end of the last touch. None: it never touched."""
     since_ns: int | None = None

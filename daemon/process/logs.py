@@ -49,7 +49,7 @@ class JournalFormatter(logging.Formatter):
 
 
 class RateLimit(logging.Filter):
-    """Filter that passes a burst of each kind of message, then one per window.
+    """Filter that passes a burst of each kind of message (logger and format), then one per window.
 
     After a window in which nothing was held back, a burst passes again.
     """
@@ -61,7 +61,8 @@ class RateLimit(logging.Filter):
         """Start of the window, s, number of messages in it, and limit, by kind."""
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Return True to pass a message. To the first in a window, add how many were held back."""
+        """Return True to pass a message. To the first of its kind in a window, add the number held
+        back in the window before."""
         now_s, kind = self._clock(), f"{record.name} {record.msg}"
         if kind not in self._kinds and len(self._kinds) >= KINDS_MAX:
             return True

@@ -53,7 +53,7 @@ class _Raw(io.FileIO):
 
 
 def _take_over() -> _Raw:
-    """Replace `sys.stdout`, and `sys.stderr` if it is closed; return the stream below stdout."""
+    """Replace `sys.stdout`, and `sys.stderr` if it is closed; return the raw stream of stdout."""
     former = sys.stdout
     if isinstance(former, io.TextIOWrapper):
         descriptor = former.fileno()
@@ -74,7 +74,7 @@ def _take_over() -> _Raw:
 
 
 def _discard(raw: _Raw) -> None:
-    """Direct the stream to nowhere, so that the interpreter's flush at its end cannot fail."""
+    """Direct the stream to /dev/null, so that the interpreter's flush at its end cannot fail."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, raw.fileno())
     os.close(nowhere)

@@ -51,7 +51,7 @@ def printable(text: str, length_max: int | None = None) -> str:
 
 
 def complain(problem: object) -> None:
-    """Write a problem to stderr."""
+    """Write the text of a problem to stderr, escaped; in the journal as an error."""
     lines = [printable(line) for line in str(problem).split("\n")]
     if is_journal(os.environ):
         sys.stderr.writelines(f"{JOURNAL_ERROR}{line}\n" for line in lines)

@@ -53,7 +53,8 @@ class Worker(Generic[R]):
         return True
 
     def take(self, wait_s: float = 0.0) -> R | Exception | None:
-        """Wait up to `wait_s` for the job; return its result or exception. None: none has ended."""
+        """Wait up to `wait_s` for the job; return its result or exception. None: no job, or it
+        still runs."""
         if not self.busy:
             return None
         poll = select.poll()

@@ -69,9 +69,9 @@ def draw_day(model: GraspMixtures, rng: np.random.Generator, grasps: int) -> Syn
 
 
 def write_stream(rows: Iterable[GraspRow], file: TextIO, t_decimals: int) -> None:
-    """Write a stream of ff, mf, th with times of `t_decimals` decimals, s.
+    """Write `rows` of ff, mf, th as a recorded stream with times of `t_decimals` decimals, s.
 
-    The label is 0 before the first grasp.
+    Its column `slipped` is 0 before the first grasp.
     """
     electrodes = [name for finger in TABLE_FINGERS for name in electrode_columns(finger)]
     file.write(",".join([TIME, OBJECT, SLIPPED, *electrodes, *JOINT_NAMES]) + "\n")

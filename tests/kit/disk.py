@@ -11,7 +11,8 @@ import pytest
 
 
 class Disk:
-    """Makes each `call` that syncs a file wait while the event `goes_on` is cleared."""
+    """Makes each `call` that syncs a file set the event `asked`, then wait for `goes_on` (set at
+    first; up to 100 s). `written`: number of calls that have waited."""
 
     def __init__(
         self, monkeypatch: pytest.MonkeyPatch, call: Literal["fsync", "fdatasync"]

@@ -73,9 +73,10 @@ class LoopBench(Companion):
         cost_ns: Callable[[], int] | None = None,
     ) -> None:
         """`stop` None: the bench has one of its own, which `run` closes. `keep`: calls its
-        argument once all outcomes are on the disk. `timing` replaces `max_age_ms` and `sleep`.
+        argument once all outcomes are on the disk. `timing` None: of `max_age_ms` and `sleep`.
 
-        With `cost_ns` time stands still except in waits and by its result, ns, for each verdict.
+        With `cost_ns`, which replaces both, the clock moves only in waits, and at each verdict by
+        its result, ns.
         """
         self.driver = driver
         self.clock = clock

@@ -16,7 +16,7 @@ decode_status = msgspec.json.Decoder(Status).decode
 
 
 def golden(name: str) -> Message:
-    """Return a golden message by the name of its file, which begins with its kind."""
+    """Return a golden message by its file's name without suffix, which begins with its kind."""
     kind = name.partition("_")[0]
     return msgspec.json.decode((GOLDEN / f"{name}.json").read_bytes(), type=MESSAGES[kind])
 

@@ -106,7 +106,9 @@ def compared(name: str) -> Row:
 # The command.
 
 
-def test_the_report_names_computer_and_broken_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_report_names_processor_and_number_of_broken_rows(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     made = graspd("report", "stability", "small-session-mf", "--quick")
     assert made.returncode == 0
     assert "| small-session-mf | all 0 | readings 1," in made.stdout

@@ -102,7 +102,8 @@ def scene_of(values: Mapping[str, Any]) -> scenes.Scene:
 
 
 def run(values: Mapping[str, Any], seed: int) -> int:
-    """Return the number of `stable` with the keys `values`; -1: the scene is rightly refused."""
+    """Return the number of `stable` verdicts with the keys `values`, in eight troubles drawn by
+    `seed`; -1: the scene is rightly refused."""
     try:
         plan = Plan.of(scene_of(values))
     except scenes.SceneError:

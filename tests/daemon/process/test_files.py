@@ -1,4 +1,4 @@
-"""Files are replaced whole or not at all, and reading one never waits."""
+"""Files are replaced whole or not at all, and reading one never waits; the install command."""
 
 from __future__ import annotations
 

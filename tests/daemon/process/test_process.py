@@ -53,7 +53,7 @@ def test_ctrl_c_while_loading_exits_with_130_and_no_output(module: str) -> None:
     assert (result.returncode, result.stdout, result.stderr) == (130, "", "")
 
 
-def test_ctrl_c_before_the_drivers_are_there_stops_the_daemon(tmp_path: Path) -> None:
+def test_ctrl_c_while_a_driver_is_imported_stops_the_daemon(tmp_path: Path) -> None:
     scene = demo_scene(tmp_path, "loop = true")
     result = python(AT_IMPORT.format(module="graspd.drivers.recordings.csv_player"), "run", scene)
     assert result.returncode == 0, result.stderr
@@ -217,7 +217,7 @@ def recording_of(folder: Path, name: str) -> Path:
     return recording
 
 
-def test_an_object_may_have_any_name_on_any_terminal(tmp_path: Path) -> None:
+def test_characters_that_the_output_encoding_lacks_are_escaped(tmp_path: Path) -> None:
     recording = recording_of(tmp_path, "größe 漢")
     code, output, errors = redirected(
         "", "replay", "--verbose", recording, PYTHONIOENCODING="latin-1"
