@@ -106,7 +106,7 @@ def test_any_reason_makes_the_verdict_unknown(where: str) -> None:
         assert decide(0.0, health, moment, 0, LIMITS) == (Decision.UNKNOWN, (reason,))
 
 
-def test_defaults_are_slip_from_one_half_and_stale_after_100_ms() -> None:
+def test_defaults_are_slip_from_half_and_stale_after_100_ms() -> None:
     for p_slip, age_ns, wanted in (
         (0.499999, 100_000_000, (Decision.STABLE, ())),
         (0.5, 100_000_000, (Decision.SLIP, ())),
