@@ -159,7 +159,7 @@ class Necessity:
         self._use(reading, ~broken)
 
     def lacks(self) -> list[str]:
-        """Return the unmet conditions of a verdict on the last reading, in words; empty: none known."""
+        """Return unmet conditions of a verdict on the last reading, in words; empty: none known."""
         lacks = [*self._unusable]
         if not lacks and not self._doubt:
             lacks += self._lacks_contact() + self._lacks_stillness() + self._lacks_joints()
