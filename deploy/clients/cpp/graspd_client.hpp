@@ -123,7 +123,7 @@ struct Verdict {
     std::optional<std::int64_t> grasp;   // number of the contact episode
     std::optional<std::int64_t> seq;
     std::string boot_id;                 // empty before the first message
-    std::optional<double> age_ms;        // least time since the reading's last byte
+    std::optional<double> age_ms;        // since the reading's last byte; from elsewhere estimated
     std::optional<double> p_slip_model;  // `p_slip` by the model alone
     std::int64_t outcomes = 0;           // number of outcomes that `p_slip` rests on
     bool supervised = false;             // graspd would learn from the lift; a person must watch
@@ -159,7 +159,7 @@ struct Verdict {
 
 // Whether to lift. True in an `if` exactly when the hand may.
 struct LiftAnswer {
-    Verdict verdict;  // that decided; its reasons may also be `no-answer` and `late`
+    Verdict verdict;  // that decided; its reasons may also be `no-answer`, `late`, `not-still`
     double waited_s = 0.0;
     // True if the hand may lift only while a person watches; such lifts must be requested.
     bool supervised = false;
@@ -167,12 +167,12 @@ struct LiftAnswer {
     explicit operator bool() const { return static_cast<bool>(verdict) || supervised; }
 };
 
-// Result of watching a lift by its fingers. True in an `if` exactly when it must be stopped.
+// Result of watching a lift by its fingers. True in an `if` when the lift must be stopped.
 struct SlideAnswer {
     Verdict verdict;  // the newest; its `fingers` and `reasons` say what is known
     double waited_s = 0.0;
     std::vector<std::string> sliding = {};  // fingers along which something slides
-    // True if fingers touched and until the timeout all of these still do and nothing slid.
+    // True if fingers touched, all of them until the timeout, and nothing slid.
     bool held = false;
 
     explicit operator bool() const { return !held; }
@@ -233,7 +233,7 @@ struct Options {
     // A `stable` with this `p_slip` or more counts as unknown. Pass the scene's `slip_threshold` if
     // it is above 0.5.
     double max_p_slip = 0.5;
-    // Called for allowed lifts whose outcome was not reported: for the first and every ten later.
+    // Called with a warning of lifts whose outcome was not reported: the first, every ten later.
     std::function<void(const std::string&)> warn = [](const std::string& text) {
         std::cerr << "graspd_client: " << text << '\n';
     };
@@ -324,7 +324,7 @@ inline Risk risk(const json& told) {
     return found;
 }
 
-// Reads the fields that daemons without learning leave out.
+// Reads `p_slip_model`, `outcomes`, `risk`, `supervised`, which daemons without learning leave out.
 inline void trust(const json& told, Verdict& found) {
     if (told.contains("p_slip_model")) found.p_slip_model = maybe(told, "p_slip_model", 1.0);
     if (found.p_slip_model && !found.p_slip) throw Malformed{};
@@ -334,7 +334,7 @@ inline void trust(const json& told, Verdict& found) {
     const auto watched = told.find("supervised");
     if (watched == told.end()) return;
     if (!watched->is_boolean()) throw Malformed{};
-    // Of an unknown grasp only if nothing but [risk] is against it.
+    // An unknown grasp is supervised only if nothing but [risk] is against it.
     found.supervised = watched->get<bool>() &&
         std::all_of(found.reasons.begin(), found.reasons.end(), [](const std::string& reason) {
             return reason == "unproven" || reason == "low-confidence";
@@ -410,8 +410,8 @@ inline Message message(const json& told) {
     return all;
 }
 
-// Returns a JSON object, or a value that is not an object for other text and for a repeated key, on
-// which readers disagree.
+// Returns the JSON object in a payload. For any other, too long or deep, or with a repeated key, on
+// which readers disagree, returns a value that is not an object.
 inline json parsed(std::string_view payload) {
     const auto opens = [](char c) { return c == '[' || c == '{'; };
     // A byte order mark is passed over by the parser, and a NUL is its end.
@@ -450,7 +450,8 @@ inline std::pair<std::optional<Message>, std::string> read(std::string_view payl
     }
 }
 
-// Returns the message of an outcome. Throws `std::invalid_argument`.
+// Returns the message that reports an outcome. Throws `std::invalid_argument` without a grasp, or
+// for a wrong name.
 inline std::string telling(const Verdict& lifted_on, Outcome how, const std::string& object_name) {
     if (lifted_on.boot_id.empty() || lifted_on.grasp.value_or(0) == 0)
         throw std::invalid_argument("nothing was lifted on a verdict that is of no grasp");
@@ -505,7 +506,7 @@ public:
         : topic_(std::move(topic)), max_age_ns_(max_age_ns), same_computer_(same_computer),
           max_p_slip_(max_p_slip) {}
 
-    // State of each finger in the messages of the last look.
+    // Each finger with each state that it had in the messages of the last look.
     std::set<std::pair<std::string, FingerState>> passed;
     Counts counts;
     bool may_be_announced = false;  // the lift that the last answer was about
@@ -513,7 +514,8 @@ public:
     // Longest silence before the grasp is unknown, ns; 0 without a message.
     Nanoseconds silence_ns() const { return message_ ? message_->silence_ns : 0; }
 
-    // Forget the message and the clocks' difference; still recognise repeats.
+    // Forget the message and the clocks' difference; still recognise repeats. `why`: reason to give
+    // until the next message.
     void forget(std::string why) {
         message_.reset();
         best_.reset();
@@ -636,8 +638,9 @@ private:
         return bound.first - std::llrint(static_cast<double>(now_ns - bound.second) * DRIFT);
     }
 
-    // Returns when a message was sent, by the own clock, as if the fastest one took no time. None
-    // for the first one, which may have been kept for late subscribers.
+    // Returns when a message was sent (own clock): after a clock comparison the earliest possible
+    // time, else as if the fastest message took no time. None for the first one, which may have
+    // been kept for late subscribers. `empty_ns`: as in `take`.
     std::optional<Nanoseconds> by_arrival(Nanoseconds published_ns, Nanoseconds empty_ns,
                                           Nanoseconds now_ns) {
         if (bound_)  // the bound holds however long it waited here
@@ -663,7 +666,7 @@ private:
     bool same_computer_;
     double max_p_slip_;
     std::optional<Message> message_;
-    std::optional<Nanoseconds> published_ns_;  // latest publication, own clock
+    std::optional<Nanoseconds> published_ns_;  // publication or an estimate, own clock
     std::string why_ = "no-message";
     std::optional<std::string> boot_id_;
     std::int64_t seq_ = -1;
@@ -880,7 +883,8 @@ public:
                                                      : newest.reasons);
     }
 
-    // Returns the decision at the deadline, with `no-answer` if no lift and no answer came.
+    // Returns the verdict, with the reason `no-answer` too if it decides nothing and the daemon
+    // answered no question.
     Verdict at_the_end(Verdict said) {
         lifts_ = permits(said);
         auto& why = said.reasons;
@@ -1140,7 +1144,7 @@ private:
     }
 
     // Read waiting messages, at most `QUEUE_MAX`, without blocking; returns true if one was new.
-    // Also takes in answers to outcomes and for clocks, and reconnects after a long silence.
+    // Also takes in answers to outcomes and clock questions, and reconnects after a long silence.
     bool drain() {
         bool anything_new = false;
         const Nanoseconds heard_ns = forget_what_is_old();
@@ -1190,7 +1194,7 @@ private:
         empty_ns_ = heard_ns_ = detail::now_ns();
     }
 
-    // Wait briefly for a message; returns false when the call must end.
+    // Wait for a message, at most `SLICE_MS`; returns false from `due_ns` on and after a fork.
     bool wait(Nanoseconds due_ns) {
         const Nanoseconds left_ns = due_ns - detail::now_ns();
         if (left_ns <= 0 || !is_here()) return false;

@@ -1,5 +1,5 @@
-// Asks graspd whether a hand may lift, and says so: 0 it may, 1 it may not. Or tells it how the
-// lift ended: 0 it was taken, 1 it was not.
+// Asks graspd whether a hand may lift, prints the answer, and exits with 0 if it may, 1 if not. Or
+// reports how the lift ended, and exits with 0 if graspd accepted that, 1 if not.
 //
 //     lift_gate [--supervised] [--still MS] ENDPOINT DEADLINE_S [ASK_ENDPOINT [OBJECT]]
 //                                                     one question; a person watches the lift; the

@@ -156,8 +156,9 @@ class Verdict:
     `decision` is `stable`, `slip` or `unknown`. `reasons` say why it is unknown: the daemon's, or
     one of those in deploy/clients/README.md. `p_slip` is the probability of slip after learning
     from `outcomes` lifts, `p_slip_model` that of the model alone; both are None when unknown.
-    `grasp` is the number of the contact episode, `age_ms` at least the time since the reading's
-    last byte. `supervised`: graspd would learn from the lift; lift only while a person watches.
+    `grasp` is the number of the contact episode, `age_ms` the time since the reading's last byte,
+    from another computer estimated. `supervised`: graspd would learn from the lift; lift only while
+    a person watches.
     `early`: it was judged when nothing moved fast, but something might still slide slowly.
     `still_ms` is for how long the hand has been still, ms: from 100 on nothing moves fast, from 240
     on nothing slides slowly either. `motion` is the motion of each finger, in units of its own
@@ -199,10 +200,10 @@ class LiftAnswer:
     """Whether to lift. True in an `if` exactly when the hand may."""
 
     verdict: Verdict
-    """Verdict that decided. Its reasons may also be `no-answer` and `late`."""
+    """Verdict that decided. Its reasons may also be `no-answer`, `late` and `not-still`."""
     waited_s: float
     supervised: bool = False
-    """True if the hand may lift only while a person watches; requested by `supervised=True`."""
+    """True if the hand may lift only while a person watches; only if asked by `supervised=True`."""
 
     def __bool__(self) -> bool:
         return bool(self.verdict) or self.supervised
@@ -210,7 +211,7 @@ class LiftAnswer:
 
 @dataclass(frozen=True)
 class SlideAnswer:
-    """Result of watching a lift by its fingers. True in an `if` exactly when it must be stopped."""
+    """Result of watching a lift by its fingers. True in an `if` when the lift must be stopped."""
 
     verdict: Verdict
     """Newest verdict; its `fingers` and `reasons` say what is known."""
@@ -218,7 +219,7 @@ class SlideAnswer:
     sliding: tuple[str, ...] = ()
     """Fingers along which something slides."""
     held: bool = False
-    """True if fingers touched and until the timeout all of these still do and nothing slid."""
+    """True if fingers touched, all of them until the timeout, and nothing slid."""
 
     def __bool__(self) -> bool:
         return not self.held
@@ -461,7 +462,10 @@ class _Hand:
 
     @contextmanager
     def _one_call(self, steps: Waits[Any]) -> Iterator[None]:
-        """Run a call in a block. Raises `RuntimeError` after a fork and during another call."""
+        """Allow no other call during the block, and close `steps`, this call's, at its end.
+
+        Raises `RuntimeError` after a fork and during another call.
+        """
         self._refuse_fork()
         if not self._turn.acquire(blocking=False):
             raise RuntimeError("another call is under way: one call at a time, or two clients")
@@ -474,8 +478,8 @@ class _Hand:
                 self._close_if_idle()
 
     def _allow(self, lift: tuple[str, int]) -> None:
-        """Note that the hand may lift this grasp, ("", 0): none. The outcome of the lift before is
-        now overdue."""
+        """Note that the hand may lift this grasp (its `_key`); ("", 0): none. The outcome of the
+        lift before is now overdue."""
         self._last = lift
         if lift[1]:
             self._lifts.setdefault(lift, False)
@@ -519,7 +523,7 @@ class _Hand:
     def _drain(self) -> bool:
         """Read waiting messages, at most `QUEUE_MAX`, without blocking; return True if one was new.
 
-        Also takes in answers to outcomes and for clocks, and reconnects after a long silence.
+        Also takes in answers to outcomes and clock questions, and reconnects after a long silence.
         """
         self._forget_what_is_old()
         self._hear()
@@ -561,7 +565,10 @@ class _Hand:
         self._empty_ns = self._heard_ns = time.monotonic_ns()
 
     def _wait(self, due_ns: int, look_ns: int | None = None) -> Waits[bool]:
-        """Wait for a message or until `look_ns`; return False from `due_ns` on and once closed."""
+        """Wait for a message, at most until `look_ns` (None: `due_ns`), perhaps less; return True.
+
+        From `due_ns` on and once closed return False at once. Both times are monotonic.
+        """
         now_ns = time.monotonic_ns()
         if now_ns >= due_ns or self._closed:
             return False
@@ -762,12 +769,12 @@ class Newest:
         of a reading that permits a lift, ns. `same_computer`, `max_p_slip`: those of the client."""
         self.counts = Counts()
         self.passed: set[tuple[str, FingerState | None]] = set()
-        """State of each finger in the messages of the last look."""
+        """Each finger with each state that it had in the messages of the last look."""
         self._topic, self._max_age_ns, self._same_computer = topic, max_age_ns, same_computer
         self._max_p_slip = max_p_slip
         self._message: _Message | None = None
         self._published_ns: int | None = None
-        """Latest possible time of the message's publication (own clock), ns; None: not known."""
+        """When the message was published, or an estimate (own clock), ns; None: not known."""
         self._why = "no-message"
         """Reason why no message is known."""
         self._boot_id: str | None = None
@@ -794,7 +801,8 @@ class Newest:
         return not knows_clock and self._best is not None
 
     def forget(self, why: str) -> None:
-        """Forget the message and the clocks' difference; still recognise repeats. `why`: reason."""
+        """Forget the message and the clocks' difference; still recognise repeats. `why`: reason to
+        give until the next message."""
         self._message, self._why = None, why
         self._best = self._bound = None
 
@@ -913,8 +921,9 @@ class Newest:
         return known_ns is not None and found.published_ns < known_ns
 
     def _by_arrival(self, published_ns: int, empty_ns: int, now_ns: int) -> int | None:
-        """Return when a message was sent, by the own clock, as if the fastest one took no time.
-        None for the first one, which may have been kept for late subscribers."""
+        """Return when a message was sent (own clock): after a clock comparison the earliest time
+        possible, else as if the fastest message took no time. None for the first one, which may
+        have been kept for late subscribers. `empty_ns`: as in `take`."""
         difference_ns = now_ns - published_ns
         if self._bound is not None:  # the bound holds however long it waited here
             return min(published_ns + self._at_least(self._bound, now_ns), now_ns)
@@ -929,7 +938,7 @@ class Newest:
         return min(empty_ns, now_ns - max(late_ns, 0))
 
     def _may_have_crept(self) -> bool:
-        """Return True if messages' delay may have grown unnoticed, like a drift of the clocks."""
+        """Return True if clocks seem to drift by over `DRIFT_MAX_NS`: the delay may have grown."""
         if self._bound is not None or self._best is None:
             return False
         return self._best[0] - self._least_ns > DRIFT_MAX_NS
@@ -993,7 +1002,8 @@ class _Question:
         return newest.unknown(*(newest.reasons or ("no-answer",)))
 
     def at_the_end(self, said: Verdict) -> Verdict:
-        """Return the decision at the deadline, with `no-answer` if no lift and no answer came."""
+        """Return the verdict, with the reason `no-answer` too if it decides nothing and the daemon
+        answered no question."""
         if self._asking is None or self._heard or said.seq is None or self.is_over(said):
             return said
         return replace(said, reasons=tuple(dict.fromkeys([*said.reasons, "no-answer"])))
@@ -1015,7 +1025,8 @@ def _was_stable(said: Verdict) -> bool:
 
 
 def _reaches(newest: Verdict, answer: Verdict) -> bool:
-    """Return True if the newest message is of the answer's start, and at least as new."""
+    """Return True if the newest message is at least as new as the answer, and the daemon did not
+    restart between them."""
     return newest.boot_id == answer.boot_id and (newest.seq or 0) >= (answer.seq or 0)
 
 
@@ -1086,7 +1097,7 @@ class _Link:
 
 
 def _close_in(process: int, link: _Link) -> None:
-    """Close the sockets of a client that was dropped; in another process do nothing."""
+    """Close the sockets of a dropped client; do nothing unless this is the process of that id."""
     if os.getpid() == process:
         link.close()
 
@@ -1133,7 +1144,8 @@ def is_same_computer(endpoint: str) -> bool:
 
 
 def _due_ns(name: str, seconds: float) -> int:
-    """Return the monotonic time when a wait of `seconds` ends, ns. Raises `ValueError`."""
+    """Return the monotonic time when a wait of `seconds` ends, ns. Raises `ValueError` for an
+    invalid wait, which names the argument `name`."""
     if not _is_amount(seconds, WAIT_MAX_S):
         raise ValueError(f"{name} must be 0 or more and finite, not {seconds!r}")
     return time.monotonic_ns() + round(seconds * 1e9)
@@ -1220,7 +1232,7 @@ def _with_stillness(said: Verdict, told: dict[str, Any]) -> Verdict:
 
 
 def _by_finger(told: Any, read: Callable[[dict[str, Any], str], Any]) -> Any:  # noqa: ANN401
-    """Return an object by finger, each value read by `read(told, finger)`; None for null."""
+    """Return `told`, an object by finger, with values as `read(told, finger)`; None for null."""
     if told is None:
         return None
     if not isinstance(told, dict):

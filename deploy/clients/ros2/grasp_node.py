@@ -11,7 +11,8 @@ from std_srvs.srv import SetBool, Trigger
 
 
 class GraspNode(Node):
-    """Publishes verdicts for people to see; a lift must rely on the service alone."""
+    """Node with the topic `~/decision`, only to look at, and the services `~/may_i_lift` and
+    `~/held`. A lift must rely on the service."""
 
     def __init__(self) -> None:
         super().__init__("graspd")

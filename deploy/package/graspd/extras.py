@@ -21,7 +21,7 @@ def require(package: str, what: str, extra: str) -> None:
 
 
 def needs(what: str, extra: str, error: ModuleNotFoundError) -> str:
-    """Return text that `what` needs a package, and how to install its `extra`.
+    """Return text that `what` needs the package missing in `error`, and how to install `extra`.
 
     Raises `error` if it is about a module of graspd itself.
     """
