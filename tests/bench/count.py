@@ -45,10 +45,8 @@ sensors = ["ff", "mf", "th"]
 
 
 def judge(kind: str) -> None:
-    """Judge the demo's first grasp, and `READINGS` more of a kind: `idle`, `judged`, else none.
-
-    Runs within cachegrind.
-    """
+    """Judge the demo's first grasp, and `READINGS` more readings of a kind: of an open hand
+    (`idle`) or a held grasp (`judged`); for another `kind` none. Runs within cachegrind."""
     now_ns = 0
     scene = Scene.model_validate(tomllib.loads(SCENE))
     pipeline = assembly.build_pipeline(Plan.of(scene), assembly.load_model(scene), lambda: now_ns)

@@ -1,8 +1,8 @@
 """How gate and finger states follow generated hands: the figures of deploy/JUDGING.md.
 
-`python -m tests.bench.gate [EPISODES]` prints a row for sweeps as a palm holds them, at 71.43 Hz,
-and one for fresh sweeps at 100 Hz. Each figure comes from EPISODES hands: they hold, or the object
-slides along their fingers.
+`python -m tests.bench.gate [EPISODES]` prints a row for sweeps at 100 Hz that repeat values of
+71.43 Hz, as a palm's do, and one for fresh sweeps at 100 Hz. Each figure comes from EPISODES hands:
+they hold, or the object slides along their fingers.
 """
 
 from __future__ import annotations
@@ -103,8 +103,8 @@ def feel(
     """Play a generated hand to the gate, and return what the gate says.
 
     The object slides along the fingers that are True in `sliding` from the start, or from a drawn
-    time after closing if `begins`. `held`: sweeps as a palm holds them. `slide_spread`: how much
-    slides differ in speed; 0: not at all.
+    time after closing if `begins`. `held`: sweeps repeat values, as a palm's do. `slide_spread`:
+    how much slides differ in speed; 0: not at all.
     """
     rng = np.random.default_rng([seed, 4])
     closed_s = REST_S + CLOSES_S
@@ -126,7 +126,7 @@ def feel(
 
 
 def cells(episodes: int, *, held: bool) -> list[str]:
-    """Return a row of the table; `held`: for sweeps as a palm holds them."""
+    """Return a row of the table, each figure of `episodes` hands; `held`: as in `feel`."""
     seeds = range(episodes)
     holds = [feel(seed, NONE, held=held) for seed in seeds]
     slides = [feel(seed, THREE, held=held) for seed in seeds]

@@ -9,7 +9,7 @@ from types import CodeType
 from typing import Final
 
 BY_ONE_MAX, BY_ONE_MAX_FLOAT = 1_000_000, 100.0
-"""Largest int and float that a mistake changes by one; larger ones change by `SHARE`."""
+"""Largest int that a mistake changes, and float that it increases, by one; others: by `SHARE`."""
 SHARE = 0.2
 
 COMPARISONS: Final[dict[type[ast.cmpop], tuple[type[ast.cmpop], ...]]] = {
@@ -52,7 +52,8 @@ class Mutant:
     """Number of the changed node in the order of `_nodes`."""
     line: int
     begin: int
-    """First line of the statement around `line`: a test that runs any of these lines runs it."""
+    """First line of the statement around `line`; a test that runs a line from it to `line` runs the
+    mutant."""
     what: str
     change: Change
     file: str
@@ -141,7 +142,8 @@ def _setter(field: str, value: object, place: int | None = None) -> Change:
 
 
 def _numbers(number: float) -> tuple[float, ...]:
-    """Return the wrong values of a number: off by one if it is small, else by `SHARE`."""
+    """Return a larger and a smaller wrong value of a number: off by one if it is small, else by
+    `SHARE`; a float's smaller one always by `SHARE`, and 0.0 has none."""
     if isinstance(number, int):
         if abs(number) <= BY_ONE_MAX:
             return number + 1, number - 1

@@ -4,9 +4,9 @@
 `tests/drivers` that execute its line, and lists those that no test notices. `--only contact.py:88`
 takes the mutants of a file or a line.
 
-The mistakes: a comparison, an operator, a `not`, `and` or `or`, a number by one; a float or a large
-number by 20 %, as one nanosecond means nothing. No source is changed: a mutant is a compiled file
-in a copy of the tree, which Python and all processes of a test run instead of the source.
+The mistakes: a comparison, an operator, a `not`, `and` or `or`, a number by one; a large number,
+and a float downwards, by 20 %, as one nanosecond means nothing. No source is changed: a mutant is a
+compiled file in a copy of the tree, which Python and all processes of a test run instead.
 
 mutmut leaves numbers outside functions alone; cosmic-ray changes files in place, one command for
 all; neither picks a sample by a seed. So this is a program of our own.
@@ -78,7 +78,7 @@ class Baseline:
             self.failed.append(report.nodeid)
 
     def concerned(self, mutant: Mutant, seconds: float) -> dict[str, float]:
-        """Return the tests that run a mutant, fastest first up to `seconds` in total, and times, s.
+        """Return tests that run a mutant, with times, s: the fastest, until these exceed `seconds`.
 
         These execute its statement. If none does, as the statement runs on import: all that execute
         any line of its file, and those whose file names its module.
@@ -148,7 +148,7 @@ class Workshop:
     """A copy of the tree in which mutants are run."""
 
     def __init__(self, root: Path, folder: Path, package: str, tests: Sequence[str]) -> None:
-        """Copy the tree at `root` into the empty `folder`. `tests`: paths from the root."""
+        """Copy the tree at `root` into `folder`, empty. `package`, `tests`: paths from `root`."""
         self._folder, self._package, self._tests = folder, package, tests
         self._log = folder / "last-run.log"
         ignored = shutil.ignore_patterns(".*", "__pycache__")

@@ -1,4 +1,4 @@
-"""Whether graspd lives for months: a daemon under faults and outages, watched for what it holds.
+"""Whether graspd can run for months: a daemon under faults and outages, watched for leaks.
 
 `python -m tests.bench.soak --seconds 120` prints what was found beside its limits, and exits 1 if
 one is broken. The daemon, the SPI twin and a second subscriber are processes of their own. With
@@ -157,8 +157,8 @@ def _resources(samples: Sequence[Usage]) -> list[Row]:
 
 
 def most(name: str, samples: Sequence[Usage]) -> float:
-    """Return the number of a resource that nine samples in ten do not exceed, as a link or a file
-    may be open for a moment."""
+    """Return the number of `descriptors` or `threads` (`name`) that nine samples in ten do not
+    exceed, as a link or a file may be open for a moment."""
     held = [getattr(sample, name) for sample in samples]
     return float(np.quantile(held, MOST_SHARE, method="lower"))
 

@@ -57,7 +57,8 @@ TITLES = ("hands", "load", "way", "sweeps", "p50, us", "p99, us", "p99.9, us")
 Heard = list[tuple[int, bytes]]
 """Time at which each message came, monotonic ns, and its payload."""
 Written = NDArray[np.int64]
-"""Tick at each sweep's end, monotonic time of that, ns, and when its bytes were written, (N, 3)."""
+"""Shape (sweeps, 3): the bridge's tick at a sweep's end, when that was and when the twin wrote the
+bytes, both monotonic ns."""
 
 
 class WireTwin(SpiTwin):

@@ -52,7 +52,8 @@ def compiled(name: str) -> Path:
 
 
 def kept(command: Callable[[Path], Words], name: str) -> Path:
-    """Return the program `name`; if not cached, run `command(folder)`, which makes it there.
+    """Return the program `name`; if not cached, run the command `command(folder)`, which makes it
+    in `folder`.
 
     The cache is valid while sources and compiler stay the same. One process makes the program, in
     four seconds, while others wait.
@@ -100,7 +101,7 @@ def asked(program: Path, *words: object, typed: str = "") -> subprocess.Complete
 
 
 def compiled_probe(name: str = "probe") -> Path:
-    """Return the program probe.cpp, compiled with sanitizers, or another of this folder."""
+    """Return the program of `name`.cpp in this folder, compiled with sanitizers."""
     skip_unless_it_can_be_compiled()
     warnings = ["-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror"]
     sanitizers = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]

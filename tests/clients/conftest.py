@@ -46,7 +46,8 @@ def cpp(request: pytest.FixtureRequest) -> Probe | None:
 
 @pytest.fixture(params=["python", "cpp"])
 def connect(request: pytest.FixtureRequest) -> Iterator[Connect]:
-    """Makes clients, in each test run of one language; those in Python are closed afterwards."""
+    """Function that makes clients; the test runs once for each language. Clients in Python are
+    closed afterwards."""
     with ExitStack() as stack:
 
         def made(folder: Path, ask: str | None = "ask") -> Either:

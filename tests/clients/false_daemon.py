@@ -46,8 +46,9 @@ def false_daemon(
 ) -> Iterator[list[bytes]]:
     """Publish verdicts of `outcome`, with fields `more`, during the block, and answer `lift`.
 
-    `answer` None: with what was published. Frames `taken` answer an outcome. Yields the list of
-    questions and outcomes received so far.
+    `messages_each` in `more`: messages on each grasp, else all are on one. `answer` None: with what
+    was published. Frames `taken` answer an outcome. Yields the list of questions and outcomes
+    received so far.
     """
     heard: list[bytes] = []
     with at_work(partial(_serve, folder, answer or told(), outcome, taken, more, heard)):

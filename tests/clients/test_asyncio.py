@@ -46,7 +46,7 @@ def test_a_lift_is_allowed_and_reported_once(tmp_path: Path) -> None:
         asyncio.run(lifts())
 
 
-def test_without_a_daemon_the_deadline_brings_a_no(tmp_path: Path) -> None:
+def test_without_a_daemon_asyncio_calls_end_at_their_deadlines(tmp_path: Path) -> None:
     async def asks() -> None:
         async with made(tmp_path) as graspd:
             answer = await graspd.may_i_lift(DEADLINE_S)

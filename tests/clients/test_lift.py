@@ -90,7 +90,7 @@ def test_after_an_unknown_answer_the_client_asks_again() -> None:
 
 
 @pytest.mark.parametrize("not_true", [1, "yes", "false", object()])
-def test_only_true_asks_for_supervised_lifts(not_true: object) -> None:
+def test_truthy_values_other_than_true_allow_no_supervised_lift(not_true: object) -> None:
     with client(World(coming(*[("unknown", TEACHES)] * 20))) as graspd:
         assert not graspd.may_i_lift(0.02, supervised=not_true)  # type: ignore[arg-type]
 
@@ -210,7 +210,7 @@ def test_an_unanswered_client_asks_again_after_ten_seconds() -> None:
     assert asked_at_ms(heard()) == [0, 10_000]
 
 
-def test_a_client_beside_the_daemon_asks_no_clock() -> None:
+def test_a_client_on_the_daemons_computer_never_asks_its_clock() -> None:
     assert asked_at_ms(heard(), same=True) == []
 
 

@@ -62,7 +62,7 @@ with Client(out, ask_endpoint=ask) as graspd:
 """Program whose forked child uses the parent's clients and its own and exits; then the parent."""
 
 
-def test_a_forked_process_gets_an_error_at_once(tmp_path: Path) -> None:
+def test_in_a_forked_process_the_parents_clients_raise_at_once(tmp_path: Path) -> None:
     places = [f"ipc://{tmp_path}/{end}" for end in ("out", "ask")]
     with false_daemon(tmp_path):
         subprocess.run([sys.executable, "-c", FORKS, *places], check=True, cwd=ROOT, timeout=60)
@@ -86,12 +86,12 @@ gc.collect()
 """Program that drops two clients unclosed, and closes one after its event loop has ended."""
 
 
-def test_a_dropped_client_closes_its_sockets(tmp_path: Path) -> None:
+def test_a_program_that_drops_clients_unclosed_still_ends(tmp_path: Path) -> None:
     place = f"ipc://{tmp_path}/out"
     subprocess.run([sys.executable, "-c", DROPPED, place], check=True, cwd=ROOT, timeout=60)
 
 
-def test_a_client_is_not_pickled_and_says_so(tmp_path: Path) -> None:
+def test_pickling_a_client_raises_a_type_error(tmp_path: Path) -> None:
     with (
         Client(f"ipc://{tmp_path}/out") as graspd,
         pytest.raises(TypeError, match="make one in each process"),
@@ -99,7 +99,7 @@ def test_a_client_is_not_pickled_and_says_so(tmp_path: Path) -> None:
         pickle.dumps(graspd)
 
 
-def test_a_second_thread_is_refused_and_may_close(
+def test_during_a_call_another_thread_may_only_close_the_client(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     waits, poll = threading.Event(), zmq.zmq_poll

@@ -1,4 +1,4 @@
-"""What a rogue publisher or an older start sends allows no lift, in either language.
+"""Nothing that a rogue publisher or an earlier start of the daemon sends lets a client lift.
 
 The messages of a case `came` in this order. Each is a verdict in which all is well, except the
 fields in `change`, the field that it is `without`, or a reading `later_ms` after the others.

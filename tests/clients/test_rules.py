@@ -44,7 +44,7 @@ many = settings(max_examples=80, suppress_health_check=[HealthCheck.function_sco
 
 @many
 @given(st.binary(max_size=200) | st.text(max_size=100).map(str.encode))
-def test_noise_is_counted_and_never_stable(cpp: Probe | None, payload: bytes) -> None:
+def test_random_bytes_are_malformed_and_never_stable(cpp: Probe | None, payload: bytes) -> None:
     rules = Rules(cpp)
     rules.take([TOPIC, payload])
     assert rules.at().reasons in [("malformed",), ("version",)]
@@ -137,7 +137,7 @@ DRIFTS = st.sampled_from([0.0, 5e-4, -5e-4])
 
 @many
 @given(st.lists(st.integers(0, 400), max_size=60), DRIFTS)
-def test_another_computers_delayed_messages_are_never_stable(
+def test_another_computers_messages_delayed_too_long_are_never_stable(
     cpp: Probe | None, delays_ms: list[int], drift: float
 ) -> None:
     rules = Rules(cpp, False)
@@ -215,7 +215,7 @@ def test_without_a_clock_comparison_little_drift_is_allowed(cpp: Probe | None) -
 
 @pytest.mark.parametrize("first", ["clock", "message"])
 @pytest.mark.parametrize("between_ms", [50, 150, 700])
-def test_with_a_known_clock_rare_reading_makes_no_message_old(
+def test_with_compared_clocks_reading_seldom_makes_no_message_too_old(
     cpp: Probe | None, first: str, between_ms: int
 ) -> None:
     """Each message may have waited since the look before, when the queue was empty."""
@@ -275,7 +275,7 @@ def test_a_decision_prints_as_its_word_on_the_wire(word: str) -> None:
     ] * 3
 
 
-def test_the_file_is_python_3_9() -> None:
+def test_the_client_file_parses_as_python_3_9() -> None:
     source = Path(graspd_client.__file__).read_text()
     ast.parse(source, feature_version=(3, 9))
     assert "from __future__ import annotations" in source

@@ -112,7 +112,7 @@ def test_in_cpp_a_lift_is_stopped_for_the_same_reasons(
 ) -> None:
     """The fingers become `later` during a lift; `passes`: and hold again before the client looks.
 
-    `answer`: the probe's, True if the lift must be stopped, and if it was held.
+    `answer`: the probe's, 1 if the lift must be stopped, 1 if it was held, and sliding fingers.
     """
     fingers = dict(HELD)
     with (

@@ -107,7 +107,8 @@ def client(world: World, ask: bool = False, same: bool | None = None) -> Iterato
 
 
 def coming(*messages: tuple[str, Mapping[str, Any]]) -> list[tuple[int, list[bytes]]]:
-    """Make messages, one every 10 ms from `START_NS` on, each of a verdict and changed fields."""
+    """Make messages with arrival times, ns, one every 10 ms from `START_NS` on, each of a verdict
+    and changed fields."""
     sent = []
     for seq, (outcome, more) in enumerate(messages):
         at_ns = START_NS + seq * 10 * MS

@@ -28,7 +28,7 @@ EVENT = np.dtype(
     [("t_ns", "<f8"), ("hz", "<u4"), ("kind", "u1"), ("value", "u1"), ("miso", "u1"), ("", "u1")]
 )
 """An event on the sensors' bus: of `kind` SELECT, `value` is the mask of the sensors whose chip
-select is low from then on; `kind` BYTE begins a byte, with MOSI as `value` and its clock, `hz`."""
+select is low from then on; `kind` BYTE begins a byte, with MOSI as `value`, and its clock, `hz`."""
 SELECT, BYTE = 0, 1
 Events = NDArray[np.void]
 
@@ -260,7 +260,7 @@ class Timing:
     duration_us: tuple[float, float]
     """Shortest and longest sweep, from the first chip select to the last."""
     late_us: float
-    """Most that a sweep began later on the grid of periods than another."""
+    """Largest less smallest time from a grid of periods to a sweep's begin."""
 
 
 def timing(whole: Sequence[Sequence[Transaction]], period_us: float) -> Timing:

@@ -48,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def renewed(kind: ModuleType, before: str, now: str) -> list[str]:
     """Return the lines of `now`, but those of `before` that differ only within the tolerance.
 
-    If their numbers differ, all lines of `now`.
+    If the numbers of lines differ, all lines of `now`.
     """
     was, lines = before.splitlines(keepends=True), now.splitlines(keepends=True)
     if len(was) != len(lines):

@@ -34,10 +34,10 @@ BOOT_ID: Final = "0123456789abcdef" * 2
 ASKED_EVERY: Final = 40
 """Number of verdicts from one question of the controller to the next."""
 SLOW_NS, SLOW_FOR, SLOW_EVERY = 15_000_000, 260, 600
-"""On a slow computer the first 260 verdicts of each 600 take 15 ms. Readings are skipped, for long
+"""In a slow case the first 260 verdicts of each 600 take 15 ms. Readings are skipped, for long
 enough to be an overload."""
 STALL_NS, STALL_AT = 160_000_000, 500
-"""On a slow computer one verdict of each 600 takes 160 ms. The next readings are too old."""
+"""In a slow case one verdict of each 600 takes 160 ms. The next readings are too old."""
 
 Message = tuple[str, str]
 """Kind of a message, such as `verdict`, and its payload."""

@@ -76,7 +76,8 @@ def demo() -> Iterator[Reading]:
 
 
 def can(log: BinaryIO | None = None) -> Iterator[Reading]:
-    """Yield the demo's readings over a CAN twin; write its frames to `log`, as candump text."""
+    """Yield the demo's readings over a CAN twin with `FAULTS`; write its frames to `log`, as
+    candump text."""
     clock = Clock(START_NS)
     twin = CanTwin("virtual", "none", _counts(), FINGERS, faults=FAULTS, clock=clock)
     injector = LinkFaultInjector(FAULTS)

@@ -39,8 +39,8 @@ LEFT_OUT: Final = IGNORED_FIELDS | {
     "model",
     "model_sha",
 }
-"""Fields that the references lack: they differ from run to run, or at every reading, and these
-show in verdict and gate."""
+"""Fields that the references lack: those of versions and runs, and those that differ at every
+reading, whose effect the verdict shows."""
 RISK: Final = {"risk": {"max_slip_when_stable": 0.3, "warm_up": 4, "explore": 0.3}}
 TWO_FINGERS: Final = ("ff", "th")
 

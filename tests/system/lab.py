@@ -46,8 +46,8 @@ class Outcome:
     what: str
     """What the step saw, in one line."""
     recovery_s: float | None = None
-    """Time from the fault to the first sound message, s, by the emulated machine's clock; None: no
-    fault."""
+    """Time from the fault or command to the result that the step awaits, s, by the emulated
+    machine's clock; None: not measured."""
 
 
 class Lab:

@@ -75,7 +75,7 @@ def start(lab: Lab) -> Outcome:
 
 
 def realtime(lab: Lab) -> Outcome:
-    """Check that the unit grants the scene's [realtime] (SCHED_FIFO, locked memory) unwarned."""
+    """Check that the daemon gets the scene's [realtime]: SCHED_FIFO, locked memory, no warnings."""
     pid = lab.show("can", "MainPID")
     policy = lab.sh(f"ps -o cls=,rtprio= -p {pid}").split()
     locked_kib = int(lab.sh(f"sed -n 's/^VmLck:[^0-9]*\\([0-9]*\\).*/\\1/p' /proc/{pid}/status"))

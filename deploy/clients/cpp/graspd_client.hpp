@@ -123,7 +123,8 @@ struct Verdict {
     std::optional<std::int64_t> grasp;   // number of the contact episode
     std::optional<std::int64_t> seq;
     std::string boot_id;                 // empty before the first message
-    std::optional<double> age_ms;        // since the reading's last byte; from elsewhere estimated
+    // Time since the reading's last byte; from another computer estimated.
+    std::optional<double> age_ms;
     std::optional<double> p_slip_model;  // `p_slip` by the model alone
     std::int64_t outcomes = 0;           // number of outcomes that `p_slip` rests on
     bool supervised = false;             // graspd would learn from the lift; a person must watch

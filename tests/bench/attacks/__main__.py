@@ -1,4 +1,4 @@
-"""Attack a daemon through its real sockets, and print how often, and what happened.
+"""Attack a daemon through its real sockets; print how much was tried, and what happened.
 
 deploy/ATTACKS.md says what each attack tries. `python -m tests.bench.attacks --minutes 60` shares
 the time evenly among them; `--only NAME` tries one. Exits with 1 if graspd failed in one.

@@ -118,7 +118,7 @@ class Hand:
 
     def outcome(self, tried: int, well: bool = True, said: str = "") -> Outcome:
         """Return the outcome after an attack; held if `well`, the daemon runs, its messages arrive,
-        and its memory grew little. `said`: the attack's own figures."""
+        and its memory grew little. `said`: the attack's own figures, which begin the text."""
         self.friend.drain()
         grown_mib = peak_mib(self.process.pid) - self.rest_mib
         lives = self.process.poll() is None
@@ -215,7 +215,7 @@ def _many(door: Connect, says: bytes) -> int:
 
 
 def _flood(door: Connect, numbers: random.Random) -> int:
-    """Send random bytes as fast as possible over `FLOODERS` connections; return their number."""
+    """Send random bytes as fast as possible over `FLOODERS` connections; return how many bytes."""
     sent, until_s = 0, time.monotonic() + FLOOD_S
     left: list[bytes] = [b""] * FLOODERS
     flooders: list[socket.socket | None] = [None] * FLOODERS

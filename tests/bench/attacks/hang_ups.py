@@ -111,7 +111,7 @@ def hang_up(door: Connect, first: bytes, awaited: bytes, then: bytes) -> int:
 
 def _hang_up_with_keys(endpoint: str, kind: int, folder: Path) -> int:
     """Fill queues and hang up as `WITH_KEYS` peers with keys, of socket type `kind`; return their
-    number. libzmq sends their heartbeats."""
+    number. libzmq sends their heartbeats. `folder`: of the keys."""
     own, server = load_pair(folder / "clients" / "friend.key_secret"), folder / "daemon.key_secret"
     with zmq.Context() as context:
         for _ in range(WITH_KEYS):
