@@ -1,8 +1,8 @@
 """Driver that plays ROS bags of a Shadow hand with BioTac SP sensors, without ROS. Extra `bag`.
 
 Topics: one of type sr_robot_msgs/BiotacAll, such as `/rh/tactile`, and sensor_msgs/JointState,
-`/joint_states`. Times are those of the headers, or of the bag where a header has none. The topic
-comes at 100 Hz, the sensors' values at 71.43 Hz.
+`/joint_states`. Times are those of the headers, or of the bag where a header has none. Tactile
+messages come at 100 Hz, new values of the sensors at 71.43 Hz.
 """
 
 from __future__ import annotations
@@ -51,11 +51,11 @@ DEFINITIONS: Final = {
     TACTILE: "std_msgs/Header header\nsr_robot_msgs/Biotac[5] tactiles\n",
     SENSOR: ("int16 pac0\nint16 pac1\nint16 pdc\nint16 tac\nint16 tdc\nint16[] electrodes\n"),
 }
-"""Messages as Shadow publishes them, for bags that do not hold their definitions."""
+"""Definitions of Shadow's messages, for bags that do not hold them."""
 LOOKED_AT: Final = 20
 """Number of messages from which it is decided which fingers have a sensor."""
 REPEAT_NS: Final = 1_000_000_000
-"""Largest step back in time of a repeated message, ns. After a larger one the clock was set."""
+"""A step back in time, ns, below which a message is a repeated one; else the clock was set."""
 CHUNK_MAX_BYTES: Final = 256 << 20
 """Largest unpacked chunk, bytes; `rosbag record` ends one at 768 KiB, not within a message."""
 
@@ -103,7 +103,7 @@ class BagDriver(ReadingsDriver[Reading]):
         """Messages of the time of the one before, or of an earlier time."""
 
     def open(self) -> None:
-        """Check that each bag has these fingers, then start. Raises `RecordingError`."""
+        """Check that each bag has the fingers to play, then start. Raises `RecordingError`."""
         self.close()
         self.reset()
         for path in self.paths:
@@ -167,7 +167,7 @@ class BagDriver(ReadingsDriver[Reading]):
 
 
 class _Bag:
-    """An open bag."""
+    """An open bag: the topics chosen from it, `tactile` and `joints` or None, and its messages."""
 
     def __init__(self, path: Path, reader: Any, *, is_ros1: bool) -> None:  # noqa: ANN401
         self._path, self._reader = path, reader
@@ -196,7 +196,7 @@ class _Bag:
     def _choose(self, kind: str) -> Connection | None:
         """Return the connection of this message type; None if the bag has none.
 
-        The first of several topics is `/joint_states`, then the right hand's, then the shortest.
+        It is that of `/joint_states`, else of the right hand's topic, else of the shortest name.
         """
         found = [each for each in self._reader.connections if each.msgtype == kind]
         found.sort(key=lambda each: (not each.topic.startswith("/rh/"), len(each.topic)))
@@ -275,7 +275,7 @@ def _unpacked(make: Callable[[], Any], packed: bytes) -> bytes:
 
 
 def _bound_ros2() -> None:
-    """Replace the unbounded functions by which rosbags unpacks ROS 2 bags."""
+    """Make rosbags unpack ROS 2 bags by functions with a limit, in place of its own."""
     bounded = SimpleNamespace(**vars(_zstd))
     bounded.decompress = partial(_unpacked, _zstd.ZstdDecompressor)
     bounded.open = lambda file, _mode: Unpacked(file, _zstd.open(file))
@@ -288,7 +288,7 @@ _bound_ros2()
 
 
 def _refuse_other_fields(path: Path, hand: dict[str, Any], sensor: dict[str, Any]) -> None:
-    """Raise `RecordingError` for definitions without the fields that are read."""
+    """Raise `RecordingError` if BiotacAll (`hand`) or Biotac (`sensor`) lacks a field to read."""
     header = Nodetype.NAME, "std_msgs/msg/Header"
     if hand.get("header") != header or _element(hand.get("tactiles")) != SENSOR:
         problem = "has a sr_robot_msgs/BiotacAll without header or list of tactiles"
@@ -309,7 +309,7 @@ def _element(field: Any) -> str:  # noqa: ANN401
 def sensors_of(path: Path, message: Any) -> NDArray[np.int64] | None:  # noqa: ANN401
     """Return the electrodes' values in a message, shape (5, 24), in the order of `FINGERS`.
 
-    An absent sensor may have no electrodes, which are 0 here. None if the message is malformed.
+    A sensor without electrodes (absent) is a row of 0. None if the message is malformed.
     Raises `RecordingError` for the former BioTac, which has 19 electrodes.
     """
     electrodes = [
@@ -325,9 +325,10 @@ def sensors_of(path: Path, message: Any) -> NDArray[np.int64] | None:  # noqa: A
 
 
 def fingers_of(path: Path) -> tuple[Finger, ...]:
-    """Return the fingers with a sensor. Raises `RecordingError` if there is none.
+    """Return the fingers whose sensor is present in most of the first `LOOKED_AT` messages.
 
-    An absent sensor has no values, or most of them at a rail: 0 or below, 4095 or above.
+    An absent sensor has no values, or at least half of them at a rail: 0 or below, 4095 or above.
+    Raises `RecordingError` if no finger has a sensor.
     """
     seen = np.zeros(len(FINGERS), dtype=np.intp)
     number = 0

@@ -48,7 +48,7 @@ _TRC_OTHERS: Final = re.compile(
 
 
 def read_asc(lines: Iterable[str]) -> Iterator[Line]:
-    """Yield frames of an ASC file, and lines that were not understood or have a relative time."""
+    """Yield frames of an ASC file, lines not understood, and any others with a relative time."""
     base, is_relative = "hex", False
     for number, text in enumerate(lines, 1):
         if head := _ASC_BASE.match(text.strip()):
@@ -94,7 +94,7 @@ def read_csv(lines: Iterable[str]) -> Iterator[Line]:
 
 
 def read_blf(stream: BinaryIO) -> Iterator[Line]:
-    """Yield frames of a BLF file up to damage, which ends it: later frames cannot be found."""
+    """Yield frames of a BLF file up to damage, then a line about it: later ones cannot be found."""
     number = 0
     try:
         for number, message in enumerate(can.BLFReader(cast(BinaryIO, _Pieces(stream))), 1):
@@ -115,7 +115,8 @@ def _message(
 
 def _logged(message: can.Message | None, text: str, first_channel: int = 0) -> Logged | None:
     """Return the frame of a message; None if it differs from its line or is incomplete. `text`: the
-    line, or empty if its data is not in hexadecimal digits. `first_channel`: number of `can0`."""
+    line, or empty if it has no data in hexadecimal digits to compare. `first_channel`: the number
+    of the channel that is `can0`."""
     if message is None or not isinstance(message.channel, int):
         return None
     t_ns, bus = round(message.timestamp * NS_PER_S), f"can{message.channel - first_channel}"
@@ -135,7 +136,7 @@ def _logged(message: can.Message | None, text: str, first_channel: int = 0) -> L
 
 
 def _is_classic(text: str, data_bytes: int) -> bool:
-    """Return True if a line `CANFD` of an ASC file says that its frame is a classic one."""
+    """Return True if a line `CANFD` of an ASC file with `data_bytes` of data is a classic frame."""
     words = text.split()
     name_words = 0 if "".join(words[5:6]).isdigit() else 1
     flags = words[11 + name_words + data_bytes :]

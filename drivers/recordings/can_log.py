@@ -1,4 +1,4 @@
-"""Driver that plays logs of CAN buses, and frames of a live link as lines of `candump -L`."""
+"""Driver that plays logs of CAN buses; frames of a live link written as lines of `candump -L`."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ FIRST_LINES: Final = 20_000
 IDS_MAX: Final = 4096
 """Most pairs of bus and id that are counted; standard frames of one bus have half as many."""
 SHOWN_MAX: Final = 8
-"""Most buses or ids in a message."""
+"""Most buses or ids named in a message for people."""
 SHOWN_LENGTH_MAX: Final = 80
-"""Most characters of a line in a message."""
+"""Most characters of a line shown in a message for people."""
 SET_BACK_NS: Final = 1_000_000_000
 """Fall of the time from which on the clock was set or another log begins, ns."""
 STEPS_SHARE: Final = 0.5
-"""Ratio of falls to rises of the time from which on times are steps since the line before."""
+"""Falls of the time as a share of its rises, from which on times count from the line before."""
 
 _TEXTS: Final = {
     Kind.CANDUMP: read_candump,
@@ -67,7 +67,7 @@ def line_of(frame: CanFrame, wall_ns: int, channel: str) -> str:
 
 
 def encode_frames(frames: Sequence[Stamped], offset_ns: int, channel: str) -> bytes:
-    """Return frames, without losses, as lines; `offset_ns`: wall time less monotonic time."""
+    """Return all but `LOST` frames as `candump -L` lines; `offset_ns`: wall less monotonic time."""
     lines = [
         line_of(frame, max(until_ns + offset_ns, 0), channel)
         for frame, _, until_ns in frames
@@ -77,7 +77,7 @@ def encode_frames(frames: Sequence[Stamped], offset_ns: int, channel: str) -> by
 
 
 def bus_name(channel: str) -> str:
-    """Return the name of a scene's channel in a log, where names have no spaces."""
+    """Return the name of a scene's channel in a log: `_` in place of each space."""
     return channel.replace(" ", "_")
 
 
@@ -112,7 +112,7 @@ class Survey:
     lines: Iterator[Line]
     """All lines of the log, the first ones included."""
     strange: str = ""
-    """The first line that was not understood, with its number."""
+    """The first line that was not understood, with its number; empty: none."""
     frames: Counter[tuple[str, int | None]] = field(default_factory=Counter)
     """Number of frames by bus and arbitration id; id None: CAN FD."""
     has_steps: bool = False
@@ -147,7 +147,7 @@ def _shown(number: int, text: str) -> str:
 
 
 class CanLog(LinkLogDriver[CanFrame]):
-    """Play CAN logs through the driver's `CanStream`, one bus of them."""
+    """Play one bus of CAN logs through the live driver's `CanStream`."""
 
     stream: CanStream
 
@@ -162,7 +162,7 @@ class CanLog(LinkLogDriver[CanFrame]):
         **board: Unpack[BoardOptions],
     ) -> None:
         """`channel`: bus to play if the logs have several. `speed`: factor of real time; None: as
-        fast as possible. `board`: options of `CanStream`. Raises `ValueError`."""
+        fast as possible. `board`: options of `CanStream`; raises `ValueError` if they are wrong."""
         super().__init__(paths, speed, clock)
         self._fingers, self._board = fingers, board
         self._channel = None if channel is None else bus_name(channel)

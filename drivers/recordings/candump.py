@@ -76,14 +76,14 @@ Line = tuple[int, str, Logged | None]
 
 
 def read_candump(lines: Iterable[str]) -> Iterator[Line]:
-    """Yield the lines that are not blank and not comments (`#`)."""
+    """Yield the lines, parsed, that are not blank and not comments (`#`)."""
     for number, text in enumerate(lines, 1):
         if text.strip() and not text.startswith("#"):
             yield number, text, parse(text)
 
 
 def parse(text: str) -> Logged | None:
-    """Return the frame in a line, `LOST` for a line of drops; None if candump never writes it."""
+    """Return the frame in a line, `LOST` for a line of drops; None: no valid frame with a time."""
     if "\x1b" in text:
         text = _COLOUR.sub("", text)
     found = _LINE.fullmatch(text)

@@ -197,7 +197,7 @@ class Cells:
 
 
 def _separator(header: str) -> str:
-    """Return the character that separates the cells of a header."""
+    """Return the most frequent of `_SEPARATORS` in a header; a space if it has none."""
     most = max(_SEPARATORS, key=header.count)
     return most if most in header else " "
 
@@ -212,7 +212,7 @@ def _name_fingers(cells: Sequence[str]) -> bool:
 
 
 def _merged(above: Sequence[str], names: Sequence[str]) -> list[str]:
-    """Return names prefixed by the finger above them, which applies until the next finger."""
+    """Return names, electrodes prefixed by the finger in `above`, which applies until the next."""
     merged, finger = list[str](), ""
     for top, name in zip_longest(above, names, fillvalue=""):
         finger = top.strip() or finger

@@ -14,7 +14,7 @@ from graspd.drivers.recordings.kinds import PAGE
 from graspd.drivers.recordings.values import are_numbers
 
 TIME: Final = "t"
-"""Column of seconds, with any zero, that graspd writes."""
+"""Name of the column of times that graspd writes: seconds since any moment."""
 OBJECT: Final = "object"
 SLIPPED: Final = "slipped"
 
@@ -37,9 +37,9 @@ SCHEMES: Final[Mapping[str, re.Pattern[str]]] = {
         "E1": rf"{_ELECTRODE}{_NUMBER}",
     }.items()
 }
-"""Patterns of electrodes' names, each by an example; the first that a file has is read. The fourth
-is of Shadow's message BiotacAll, for ff, mf, rf, lf, th. The fifth, of BioTacHand, names no finger,
-and the last one is for a single finger."""
+"""Patterns of electrodes' names, by an example of each; a file is read by the first that fits any
+of its names. The fourth is of Shadow's message BiotacAll, for ff, mf, rf, lf, th. The fifth, of
+BioTacHand, names no finger, and the last one is for a single finger."""
 
 ONE_ROW: Final = "put all fingers into one row, as ff_e1 and mf_e1"
 HEADER_ELECTRODES_MIN: Final = 12
@@ -176,7 +176,7 @@ def is_electrode(name: str) -> bool:
 
 
 def with_units(names: Sequence[str], cells: Sequence[str]) -> list[str] | None:
-    """Return names with the units of the row below; None if the cells are not units."""
+    """Return names with units, as `t [s]`, from the `cells` below; None if these are not units."""
     units = [cell.strip("[]()- ") for cell in cells]
     given = {unit.lower() for unit in units} - {""}
     if not given or not given <= UNITS:
@@ -187,7 +187,7 @@ def with_units(names: Sequence[str], cells: Sequence[str]) -> list[str] | None:
 def _electrodes(
     path: Path, names: Sequence[str], fingers: Sequence[str], line: int
 ) -> dict[str, dict[int, int]]:
-    """Return the places of electrodes, by finger and number from 0."""
+    """Return places of electrodes by finger, then number from 0. Raises `RecordingError`."""
     for example, scheme in SCHEMES.items():
         found: dict[str, dict[int, int]] = {}
         for place, name in enumerate(names):
@@ -224,7 +224,8 @@ def _whole(
     line: int,
     finger_column: tuple[int, str] | None,
 ) -> dict[str, dict[int, int]]:
-    """Return `found` with numbers from 0; raise if a finger that is read lacks electrodes."""
+    """Return `found`, places by finger and number, with numbers from 0; raise `RecordingError` if a
+    finger to read lacks electrodes or has too many. `example`: that of the names' scheme."""
     base = min(1, *(min(numbers) for numbers in found.values()))
     is_named = found.keys() <= _PLACES.keys()
     for finger in fingers if fingers and is_named else found:
@@ -274,7 +275,7 @@ def _written(example: str, finger: str) -> str:
 
 
 def _nearest(names: Sequence[str]) -> str:
-    """Return text on the name that is most like an electrode's, and the expected names."""
+    """Return text for an error: the expected names, and the name most like one of them."""
     from difflib import SequenceMatcher  # only where it is needed
 
     likeness = [

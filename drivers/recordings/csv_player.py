@@ -56,7 +56,7 @@ class ReplayDriver(ReadingsDriver[tuple[Row, bool]]):
     """Play one or more tables and streams, at most one row per call of `read_ready`.
 
     A row gives a `TactileReading` of `fingers`, after a `JointReading` if the file has joints.
-    `recorded_ns` is the file's own time. No reading is skipped.
+    `recorded_ns` counts from the first row of the first file. No reading is skipped.
 
     `open` and `read_ready` raise `RecordingError` for a wrong file, header or row. Values that are
     not counts, and a last row without a line end, make a reading faulty; with `strict` they raise.
@@ -119,7 +119,7 @@ class ReplayDriver(ReadingsDriver[tuple[Row, bool]]):
         return [self.hand_over(reading, at_ns) for reading in made]
 
     def _items(self) -> Generator[tuple[int, tuple[Row, bool]], None, None]:
-        """Yield times, ns, and rows of all files on one time axis; True: another stream begins."""
+        """Yield time, ns, on one axis for all files, row, and True if a new stream begins there."""
         start_ns = 0
         while True:
             for path in self.paths:
@@ -130,7 +130,7 @@ class ReplayDriver(ReadingsDriver[tuple[Row, bool]]):
     def _items_of(
         self, path: Path, start_ns: int
     ) -> Generator[tuple[int, tuple[Row, bool]], None, int]:
-        """Yield the rows of one file; return the start time of the next file."""
+        """Yield the rows of one file as `_items` does; return the start of the next file, ns."""
         at_ns, first_s, period_ns = start_ns, None, 0
         rows = read_rows(path, self._fingers, strict=self._strict, layout=self._layouts[path])
         for index, row in enumerate(rows):
@@ -147,7 +147,7 @@ class ReplayDriver(ReadingsDriver[tuple[Row, bool]]):
         return at_ns + (period_ns or round(self._table_period_ns))
 
     def _readings(self, row: Row, at_ns: int, interrupted: bool) -> Iterator[Reading]:
-        """Yield joints, then counts of a row."""
+        """Yield the readings of a row, joints (if it has any) before counts, and count them."""
         index, faults = self.counters.readings, row.faults
         if row.joint_names:
             yield JointReading(at_ns, index, row.joint_names, row.position_rad)

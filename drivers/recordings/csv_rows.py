@@ -119,9 +119,9 @@ class Recording:
         return np.array(counts, dtype=np.uint16).reshape(self._shape), faults
 
     def _unusual(self, text: str, place: int, faults: NDArray[np.uint8]) -> int:
-        """Return the count in a cell of unusual text; without one, flag `place` and return 0.
+        """Return the count in a cell of unusual text; without one, return 0 and flag its electrode.
 
-        Raises instead if strict.
+        `place`: that electrode, in `faults` laid flat. Raises instead of flagging if strict.
         """
         count = count_of(text, decimal_comma=self._comma)
         if count is not None:
@@ -187,8 +187,8 @@ def read_rows(
 ) -> Iterator[Row]:
     """Yield the rows of a file. `layout`: of this file; None: find it out.
 
-    With `strict`, a value that is not a count raises; with `outcomes`, an unreadable outcome does.
-    Raises `RecordingError`.
+    Raises `RecordingError`; with `strict` also for a value that is not a count or angle and for a
+    last row without a line end, with `outcomes` for an unreadable outcome.
     """
     with open_recording(path) as file:
         layout = layout or survey(path, file, fingers)

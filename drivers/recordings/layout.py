@@ -37,7 +37,7 @@ NEAR_COUNTS: Final = 8.0
 """Largest root mean square difference, counts, of rows that nearly repeat each other.
 
 Sweeps of a hand at rest differ by 3 to 6. At most 5 % of the published grasps are that near to
-another one, and 20 % within ten of one object. In streams at 4 to 100 Hz 33 to 61 % are.
+another one, and 20 % among ten of one object. In streams at 4 to 100 Hz 33 to 61 % are.
 """
 STEP_COUNTS: Final = 25.0
 """Largest difference of rows that may be successive sweeps, counts. In streams 74 to 97 % of rows
@@ -46,7 +46,7 @@ NEAR_SHARE_MAX: Final = 0.2
 """Largest share of rows up to `NEAR_COUNTS` from another in a grasp table."""
 ALIKE_SHARE_MAX: Final = 0.85
 """Largest share, in a grasp table, of rows up to `STEP_COUNTS` from another; rows within
-`NEAR_COUNTS` count twice. In noisy streams up to 100 % are within the former, none in the latter.
+`NEAR_COUNTS` count twice. In noisy streams up to 100 % are within `STEP_COUNTS`, none nearer.
 """
 DOUBTED_SHARES: Final = 0.1, 0.6
 """`NEAR_SHARE_MAX` and `ALIKE_SHARE_MAX` for rows with neither both outcomes nor `read_as`.
@@ -55,14 +55,16 @@ Among pieces of 12 sweeps at 4 Hz, 2 % are below these limits, and 22 % below th
 pieces of 12 published grasps in a row, 20 % are above these, and among random ones under 1 %.
 """
 FEW_ROWS: Final = 10
-"""Fewest rows by which a file can be refused as what `read_as` says."""
+"""Fewest rows by which a file is refused in spite of `read_as`, or for times that fall."""
 MIDDLE_SHARE_MAX: Final = 0.1
-"""Largest share of rows neither near nor far, in a table with several readings of each grasp. Such
-tables have up to 5 %, streams 35 to 45 %."""
+"""Largest share of rows `NEAR_COUNTS` to `STEP_COUNTS` from the nearest, in a table with several
+readings of each grasp. Such tables have up to 5 %, streams 35 to 45 %."""
 BETWEEN_SHARE_MAX: Final = 0.6
-"""Largest share of these rows among all that are not near; streams have 63 to 95 %."""
+"""Largest share of the rows of `MIDDLE_SHARE_MAX` among all beyond `NEAR_COUNTS` from the nearest;
+streams have 63 to 95 %."""
 JUMP_SHARE_MIN: Final = 0.02
-"""Smallest share of rows far from the row before in such a table: one new grasp in 50 readings."""
+"""Smallest share of rows beyond `STEP_COUNTS` from the row before, in a table with several readings
+of each grasp: one new grasp in 50 readings."""
 STEP_S: Final = (0.002, 0.5)
 """Shortest and longest usual time between sweeps, s, by which the unit of times is found."""
 SLOWEST_S: Final = 1.0
@@ -198,7 +200,8 @@ class _Rows:
                 raise RecordingError(self.path, problem)
 
     def is_timed(self, read_as: ReadAs | None, rate_hz: float | None) -> bool:
-        """Return True for a stream, by `read_as`, else by times. Raises without times or rate."""
+        """Return True for a stream: by `read_as`, or if None, for rows with times. Raises for
+        `stream` without times or rate."""
         if read_as == "stream" and self.columns.time is None and rate_hz is None:
             raise RecordingError(self.path, "has no column of times: give --rate-hz too")
         return read_as == "stream" or (read_as is None and self.columns.time is not None)
@@ -225,14 +228,14 @@ class _Rows:
         return is_clock(self.first[0][column.places[0]])
 
     def blocks(self) -> Iterator[NDArray[np.float32]]:
-        """Yield the counts of the whole file, shape (rows, electrodes); a missing one is NaN."""
+        """Yield the counts of the whole file in blocks, shape (rows, electrodes); NaN: missing."""
         rows: Iterable[list[str]] = chain(self.first, self._others)
         while cells := list(islice(rows, BLOCK_ROWS)):
             self._note_fingers(cells)
             yield self._counts(cells)
 
     def follow_each_other(self) -> bool:
-        """Return True if most of the first rows are a small step from the row before."""
+        """Return True if most of the first rows are up to `STEP_COUNTS` from the row before."""
         counts = _without_gaps(self._counts(self.first))
         steps = _apart(counts[1:], counts[:-1])
         return 2 * int((steps <= STEP_COUNTS).sum()) > len(steps)
@@ -270,7 +273,7 @@ def time_value(
 
 
 def _unit_s(rows: _Rows, column: TimeColumn, times: Sequence[float], step: float) -> float:
-    """Return the unit of times, s, by the column's name, the size of times, or the usual step."""
+    """Return the unit of times, s, by the column's name, their size, or their median `step`."""
     if rows.is_clock(column):
         return 1.0
     if column.unit_s is not None:

@@ -83,7 +83,8 @@ class RecordedDriver(Opened, Generic[Item]):
         return began_ns + round((at_ns - first_ns) / (self.speed or 1.0))
 
     def take(self) -> tuple[int, Item] | None:
-        """Return time, ns, and content of the next item; None: not due. Raises `RecordingError`."""
+        """Return time, ns, and content of the next item; None: not due, or none left. Raises
+        `RecordingError`."""
         if self._playing is None:
             raise RuntimeError("the replay is not open")
         now_ns, item = self._clock(), self._next
@@ -169,7 +170,7 @@ class LinkLogDriver(RecordedDriver[Item]):
 
     @abstractmethod
     def begin(self) -> None:
-        """Make a new `stream`."""
+        """Make a new decoder, `stream`."""
 
     @abstractmethod
     def feed(self, t_ns: int, record: Item) -> Sequence[Reading]:

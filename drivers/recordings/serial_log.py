@@ -68,7 +68,8 @@ class SerialLog(LinkLogDriver[Record]):
         *,
         speed: float | None = None,
     ) -> None:
-        """Take the arguments of `RecordedDriver` and `Conversation`."""
+        """`fingers`, `sensors`: as in `Conversation`. `speed`: factor of real time; None: as
+        fast as possible."""
         super().__init__(paths, speed)
         self._fingers, self._sensors = fingers, sensors
         self.begin()

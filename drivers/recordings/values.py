@@ -63,13 +63,13 @@ def count_of(cell: str, *, decimal_comma: bool = False) -> int | None:
 
 
 def time_of(cell: str, *, decimal_comma: bool = False) -> float | None:
-    """Return a time: a number in any unit, or the seconds of an ISO 8601 text; None: neither."""
+    """Return a time: a number in any unit, or seconds of a date, clock or span; None: neither."""
     number = number_of(cell, decimal_comma=decimal_comma)
     return _clock_s(cell.strip()) if number is None else number
 
 
 def is_clock(cell: str) -> bool:
-    """Return True for a time in ISO 8601, which is in seconds."""
+    """Return True for a date, a time of day or a span, which `time_of` returns in seconds."""
     return _clock_s(cell.strip()) is not None and number_of(cell) is None
 
 
@@ -88,7 +88,7 @@ def _clock_s(text: str) -> float | None:
 
 
 def outcome_of(cell: str) -> bool | None:
-    """Return how a lift ended: True slip, False stable, None not known. Raises `ValueError`."""
+    """Return how a lift ended: True slip, False stable, None blank. Raises `ValueError` else."""
     text = cell.strip().lower()
     if text not in _OUTCOMES:
         problem = "is not an outcome: 0, False or stable; 1, True or slip; blank if it is not known"

@@ -30,11 +30,11 @@ class Sweep(NamedTuple):
     """Stamp of the header, ns; the bag's own time is 0.7 ms later."""
     electrodes: dict[str, NDArray[np.int16]]
     angles: Mapping[str, float] = MappingProxyType({})
-    """Angles of a message of `/joint_states` 1 ms earlier."""
+    """Angles of a message of `/joint_states` 1 ms earlier; empty: no such message."""
 
 
 class BagOf:
-    """Makes messages of one version of ROS."""
+    """Makes messages and bags of one version of ROS. `biotac`: definition of Biotac."""
 
     def __init__(self, version: int, biotac: str = BIOTAC) -> None:
         self.version = version
@@ -88,7 +88,8 @@ class BagOf:
         packing: rosbag1.Writer.CompressionFormat | rosbag2.CompressionMode | None = None,
         **options: Any,  # noqa: ANN401
     ) -> Path:
-        """Write a bag and return `path`. `options`: of the writer of ROS 2."""
+        """Write a bag and return `path`. `topic`: that of sweeps. `packing`: None for a plain bag.
+        `options`: of the writer of ROS 2."""
         if self.version == 1:
             writer: Any = rosbag1.Writer(path)
         else:

@@ -23,7 +23,7 @@ def count(row: int, electrode: int) -> int:
 
 
 def cells(row: int, changes: Mapping[str, str] | None = None) -> dict[str, str]:
-    """One row of a table by column name."""
+    """One row of a table by column name; `changes` replaces cells."""
     values = {"object": f"thing_{row}", "slipped": str(row % 2)}
     values.update({name: str(count(row, index)) for index, name in enumerate(ELECTRODES)})
     values.update(changes or {})
@@ -52,7 +52,7 @@ def stream(
     joints: Mapping[str, Sequence[str]] | None = None,
     columns: Sequence[str] | None = None,
 ) -> bytes:
-    """A stream without labels; `joints` gives the cells of each joint column."""
+    """A stream without labels; `joints`: cells by joint column; `columns`: header, None for all."""
     joints = joints or {}
     columns = columns or ["t", *ELECTRODES, *joints]
     lines = [",".join(columns)]

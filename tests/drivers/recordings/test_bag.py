@@ -310,7 +310,7 @@ def test_of_two_hands_in_a_bag_the_right_is_played(
     assert not has_joints(path)
 
 
-def test_a_message_of_short_sensors_is_left_out_and_counted(tmp_path: Path) -> None:
+def test_a_message_with_too_few_electrodes_is_dropped_and_counted(tmp_path: Path) -> None:
     sweeps = noise(3)
     sweeps[1].electrodes["ff"] = ABSENT[:20]
     path = BagOf(1).write(tmp_path / "hand.bag", sweeps)
@@ -321,7 +321,7 @@ def test_a_message_of_short_sensors_is_left_out_and_counted(tmp_path: Path) -> N
     assert (readings, driver.counters.malformed) == (2, 1)
 
 
-def test_joints_are_read_from_the_topic_of_that_name(tmp_path: Path) -> None:
+def test_joints_are_read_from_joint_states_among_several_topics(tmp_path: Path) -> None:
     bag, path, kind = BagOf(1), tmp_path / "hand.bag", "sensor_msgs/msg/JointState"
     with rosbag1.Writer(path) as writer:
         for topic, angle in (("/rh/j", 0.6), ("/joint_states", 0.5), ("/j", 0.7)):

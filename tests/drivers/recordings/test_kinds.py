@@ -113,7 +113,7 @@ OTHERS: dict[str, tuple[bytes | Callable[[Path], None], str]] = {
 
 
 @pytest.mark.parametrize(("content", "said"), OTHERS.values(), ids=OTHERS)
-def test_other_files_are_refused_with_a_reason_and_the_page(
+def test_other_kinds_are_refused_with_a_reason_and_documentation_page(
     tmp_path: Path, content: bytes | Callable[[Path], None], said: str
 ) -> None:
     path = made(tmp_path / "grasps.csv", content)

@@ -28,7 +28,7 @@ PLAIN = table(4)
 
 
 def values(rows: Sequence[Row]) -> list[object]:
-    """Counts, object and outcome of each row, and True if a count is faulty."""
+    """Counts, True if one is faulty, object and outcome of each row."""
     return [
         (row.counts.tolist(), row.faults.any(), row.annotation.object_name, row.annotation.slipped)
         for row in rows
@@ -110,7 +110,7 @@ def test_parquet_reads_as_its_csv_unless_damaged(tmp_path: Path) -> None:
 
 
 def renamed(name: Callable[[str, int], str], fingers: Sequence[str] = FINGERS) -> bytes:
-    """The plain table, its electrodes called `name(finger, number from 1)`."""
+    """The plain table, electrodes of `fingers` called `name(finger, number from 1)`."""
     header, rest = PLAIN.decode().split("\n", 1)
     names = {f"{f}_biotac_{n}": name(f, n) for f in fingers for n in range(1, 25)}
     return (",".join(names.get(each, each) for each in header.split(",")) + "\n" + rest).encode()
@@ -230,7 +230,7 @@ def test_a_row_with_an_electrode_is_not_a_header(content: bytes) -> None:
         (lambda f, n: f"{f}_e{n}" if f != "th" else f"x{n}", "the file has the fingers ff, mf"),
     ],
 )
-def test_an_unknown_column_name_is_refused_with_a_remedy(
+def test_wrong_electrode_columns_are_refused_with_the_reason(
     name: Callable[[str, int], str], said: str
 ) -> None:
     assert said in refusal(renamed(name))

@@ -97,7 +97,7 @@ def test_lines_of_candump_are_read(line: str, t_ns: int, frame: CanFrame | None)
         " (2015-13-10 06:17:32.249713)  can0  123   [3]  0D 3A 1F",
     ],
 )
-def test_a_line_that_is_not_a_frame_gives_none(line: str) -> None:
+def test_a_line_without_a_time_or_valid_frame_gives_none(line: str) -> None:
     assert parse(line) is None
 
 

@@ -21,7 +21,7 @@ from tests.drivers.recordings.tables import (
 
 
 def sweeps(number: int = 260) -> tuple[list[str], NDArray[np.str_]]:
-    """Header and cells of the begin of the demo's stream: one grasp."""
+    """Header and cells of the first `number` rows of the demo's stream; 260 hold one grasp."""
     header, *lines = DEMO_RECORDING.read_text().splitlines()[: number + 1]
     return header.split(","), np.array([line.split(",") for line in lines])
 
