@@ -164,7 +164,7 @@ class LinkCause(Enum):
     SETTINGS = auto()
     """The device's electrodes or rate differ from those that the scene needs, or from before."""
     SERIALS = auto()
-    """The device gives different serial numbers each time it is asked."""
+    """The device's serial numbers have changed, or differ each time it is asked."""
     CLOCK = auto()
     """The device's clock stands still, goes back or jumps."""
 
@@ -311,7 +311,7 @@ class LinkError(DriverError):
 
 
 class RecordingError(DriverError):
-    """A recording has the wrong content; no later try can succeed."""
+    """A recording cannot be read or has the wrong content; no later try can succeed."""
 
     def __init__(
         self, path: Path, problem: str, *, line: int | None = None, column: str | None = None

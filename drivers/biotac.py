@@ -86,7 +86,7 @@ def decode_words(
 
 
 def _tables() -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
-    """Return count and fault of all 65536 words, so that a sweep takes two look-ups."""
+    """Return counts and faults, each indexed by all 65536 words: a sweep takes two look-ups."""
     counts = np.zeros(1 << 16, dtype=np.uint16)
     faults = np.full(1 << 16, int(ElectrodeFault.PARITY), dtype=np.uint8)
     for count in range(COUNT_MAX + 1):
@@ -126,7 +126,7 @@ def make_reading(
     """Return the reading of `words`, shape (fingers, 24), and count it in `counters`.
 
     `marks`: `ElectrodeFault` bits known before; words marked `MISSING` are ignored.
-    `t_ns`: time of the last byte.
+    `t_ns`: end of the sweep, as in `TactileReading`.
     """
     counts, faults = decode_words(words)
     if np.count_nonzero(faults) or np.count_nonzero(marks):

@@ -54,7 +54,7 @@ class LinkState(StrEnum):
 
 
 def longest_silence_ns(period_ns: int | None) -> int:
-    """Return how long a link with this time between readings may be silent, ns."""
+    """Return how long a link may be silent, ns; `period_ns`: between readings, None: not known."""
     return max(SILENCE_PERIODS * (period_ns or 0), SILENCE_MIN_NS)
 
 
@@ -170,7 +170,7 @@ class SenderClock:
     def made_ns(self, t_s: float | None, received_ns: int) -> int:
         """Return the latest time at which a message can have been made, monotonic ns.
 
-        `t_s`: the sender's time, s; None: not known.
+        `t_s`: the sender's time, s; None: not known, which gives `received_ns`.
         """
         if t_s is None:
             return received_ns

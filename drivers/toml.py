@@ -29,7 +29,7 @@ A string without an end is a token too; `tomllib` refuses it.
 
 
 class NestedTooDeeplyError(ValueError):
-    """The text nests more than `DEPTH_MAX` levels."""
+    """Brackets nest deeper, or a dotted key has more parts, than `DEPTH_MAX`."""
 
 
 def loads(text: str) -> dict[str, Any]:

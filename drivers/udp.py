@@ -169,11 +169,11 @@ Stream = TypeVar("Stream", bound=DatagramStream)
 
 
 class DatagramDriver(Opened, Generic[Stream]):
-    """Pass the datagrams of one sender to a stream.
+    """Driver that reads the datagrams of one sender by a stream.
 
     The sender (address and port) of the first good datagram is the only one until the link is
     lost, so two hands need two ports. The constructor raises `ValueError` for a wrong `source`.
-    `open` raises `LinkError` if it cannot listen. `read_ready` raises nothing.
+    `open` raises `LinkError` if it cannot listen. No fault of the link makes `read_ready` raise.
     """
 
     name: str
@@ -253,7 +253,7 @@ class DatagramDriver(Opened, Generic[Stream]):
         return None if self._receiver is None else self._receiver.fileno()
 
     def due_ns(self) -> int | None:
-        """Return the time, ns, to reopen the socket or to notice silence."""
+        """Return the time, ns, to reopen the socket or to notice silence; None: neither."""
         if self.link.state is LinkState.UP:
             return self._good_t_ns + self.silence_ns
         return self.link.retry_ns

@@ -38,7 +38,7 @@ NONCES = 1 << 32
 PINGS_OUT_MAX = 8
 """Most PINGs that may wait for an answer; the oldest is given up."""
 PERIOD_MAX_NS = 1_000_000_000
-"""Longest accepted time between sweeps, ns. Silence of a slower bridge is noticed too late."""
+"""Longest accepted time between sweeps, ns. A slower bridge's silence would show too late."""
 
 _FROM_BRIDGE: Final = (Hello.TYPE, Sweep.TYPE, BridgeStatus.TYPE)
 
@@ -257,7 +257,8 @@ class Conversation:
             self._ping_due_ns = now_ns
 
     def _greet(self, hello: Hello, sent_ns: int, now_ns: int) -> None:
-        """Start the sweeps if the bridge fits the scene and its serial numbers are confirmed."""
+        """Start the sweeps; refuse a bridge that does not fit the scene; PING again if its serial
+        numbers are not confirmed. `sent_ns`: when the answered PING was sent."""
         needed = max(self._sensors) + 1
         if hello.sensors < needed:
             why = f"has {hello.sensors} sensors, the scene needs {needed}"

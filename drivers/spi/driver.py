@@ -24,7 +24,7 @@ from graspd.drivers.spi.messages import Stop, encode
 from graspd.drivers.spi.sweeps import BridgeCounters
 
 BAUD = 921_600
-"""Bits per second: 92 kB/s, three times the longest sequence; 115200 is too slow for any."""
+"""Bits per second: 92 kB/s, three times what the longest sequence needs; 115200 is too slow."""
 POLL_NS = 2_000_000
 """Time between reads of a port without a descriptor, ns."""
 READ_BYTES = 4096
@@ -102,7 +102,7 @@ class SpiBridgeDriver(Opened):
         self._connect()
 
     def tap(self, sink: Callable[[LineEvent, bytes], None]) -> None:
-        """Pass all bytes that are read or written from now on to `sink` too."""
+        """Pass all bytes read or written from now on, and each opening, to `sink` too."""
         self._line.tap = sink
 
     def close(self) -> None:
@@ -242,7 +242,7 @@ class SerialLine:
             held.close()
 
     def read(self) -> bytes:
-        """Return all bytes that have arrived. Raises `LinkError`."""
+        """Return the bytes that have arrived, of at most `READS_MAX` reads. Raises `LinkError`."""
         port, data = self._opened(), b""
         least = SHORT_BYTES if isinstance(port, PolledSerial) else 1
         try:

@@ -227,7 +227,7 @@ class Sweep(msgspec.Struct, frozen=True, eq=False, gc=False):
     present: int
     """Bit i is set if sensor i answered when the bridge last asked for its serial number."""
     words: NDArray[np.uint16]
-    """Response words, shape (slots, sensors), in either byte order (manual figure 15)."""
+    """Response words (manual figure 15), shape (slots, sensors); the array has any byte order."""
 
     def is_sound(self) -> bool:
         slots, sensors = self.words.shape

@@ -63,7 +63,7 @@ class BridgeCounters(FrameCounters):
     unplugged_words: int = 0
     """Words read from a line that no sensor drives.
 
-    Like the two counters above, it leaves out absent sensors.
+    Like `parity_words` and `error_words`, it leaves out absent sensors.
     """
     absent_sensors: int = 0
     """Sensors without a serial number; each counts once in each sweep."""
@@ -187,7 +187,7 @@ class DeviceClock:
     """
 
     def __init__(self, tick_hz: int, tick: int, sent_ns: int, received_ns: int) -> None:
-        """`tick_hz`: nominal rate, Hz, above 0. The first PING: as in `round_trip`."""
+        """`tick_hz`: nominal rate, Hz, above 0. Others: of the first PING, as in `round_trip`."""
         self.round_trip_ns = received_ns - sent_ns
         """Shortest round trip of a PING, ns."""
         self._ns_per_tick = 1e9 / tick_hz

@@ -129,8 +129,8 @@ class Unit:
 def arrivals(plan: Sequence[Step], silent: int, late_max: int = 3) -> Iterator[Unit]:
     """Units in the order in which they come.
 
-    A board that begins again is silent for `silent` units first; what is late or doubled comes at
-    most `late_max` units after it was sent.
+    A board that begins again is silent for `silent` units first. A late or repeated unit that would
+    come more than `late_max` units after it was sent never comes.
     """
     at = index = boot = 0
     recent: list[Unit] = []

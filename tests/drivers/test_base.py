@@ -127,7 +127,7 @@ def test_retry_waits_grow_to_one_second_until_link_is_up() -> None:
     assert link.retry_ns == clock.now_ns + 50_000_000
 
 
-def test_each_reason_is_logged_once_per_outage(caplog: pytest.LogCaptureFixture) -> None:
+def test_each_reason_is_one_warning_per_outage(caplog: pytest.LogCaptureFixture) -> None:
     link = Link("spi")
     with caplog.at_level(logging.DEBUG):
         link.start(2_000_000_000)

@@ -31,7 +31,7 @@ PACKETS = [
     [packet.to_bytes() + appended for packet in PalmTwin(sweeps_of(4), palm=palm).packets()]
     for palm, appended in itertools.product(Palm, (b"", bytes(CAN_RECORD_BYTES)))
 ]
-"""Four rounds of each kind of palm."""
+"""Packets of four rounds by kind of palm, each without and with a CAN record appended."""
 
 
 @st.composite

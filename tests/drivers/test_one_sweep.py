@@ -65,7 +65,7 @@ Feed = Callable[[Unit, int, int], Sequence[Reading]]
 """Function that gives a driver a unit, of the sweep of this number, at this time in ns."""
 Link = tuple[Feed, DriverCounters]
 COPIES = ("duplicates", "duplicate_frames", "duplicate_packets", "old_messages")
-"""Names by which the links count repeated units."""
+"""Names of the links' counters of repeated units."""
 
 
 def words_of(number: int) -> NDArray[np.uint16]:
@@ -183,7 +183,7 @@ class Assembler:
     age_ns: int = 0
     """Most by which a reading's time is before the arrival of its last unit."""
     boot_units: int | None = None
-    """Units that each restart of the board skips; None: those of `SWEEPS_PER_BOOT` sweeps."""
+    """Units by which each restart raises sweep numbers; None: those of `SWEEPS_PER_BOOT` sweeps."""
     examples: int = 80
     steady_sweeps: int = 1
     """Undisturbed sweeps at the beginning."""

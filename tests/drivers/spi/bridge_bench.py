@@ -1,4 +1,4 @@
-"""The other end of a serial bridge for tests: messages, a scripted port, or the twin at work."""
+"""The bridge's end of a serial line for tests: its messages, passed by calls or a scripted port."""
 
 from __future__ import annotations
 

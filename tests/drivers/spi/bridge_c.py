@@ -124,7 +124,7 @@ def damaged(rng: random.Random) -> bytes:
 
 
 def words_of(sweep: bytes) -> Counts:
-    """Response words of a SWEEP, shape (slots, sensors)."""
+    """Response words of a SWEEP as sent, with parity bits, shape (slots, sensors)."""
     sensors, slots = sweep[21], sweep[22]
     return np.frombuffer(sweep, ">u2", offset=23).reshape(slots, sensors).astype(np.uint16)
 

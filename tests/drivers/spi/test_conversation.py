@@ -292,7 +292,7 @@ def test_readings_wait_for_two_hellos_of_the_same_sensors(
     assert conversation.serials.get("mf") == believed
 
 
-def test_a_bridge_of_changing_sensors_is_given_up() -> None:
+def test_a_bridge_whose_serial_numbers_keep_changing_is_given_up() -> None:
     conversation = opened()
     for number in range(5):
         told(conversation, (f"A{number}", "B", "C"), T0)

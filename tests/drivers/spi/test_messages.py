@@ -195,7 +195,7 @@ def test_a_hello_with_a_forbidden_field_decodes_to_none(changes: dict[str, int])
 def test_only_a_sweep_within_the_limits_is_decoded(
     sensors: int, slots: int, present: int, ticks: tuple[int, int], sense: bool
 ) -> None:
-    """The length fits in all cases."""
+    """The length of the payload fits `sensors` and `slots` in all cases."""
     payload = struct.pack("<IQQBBB", 7, *ticks, present, sensors, slots)
     assert (decode(0x02, payload + bytes(2 * sensors * slots)) is not None) == sense
 

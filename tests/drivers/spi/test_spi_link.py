@@ -188,7 +188,7 @@ def test_a_twin_replaces_a_dead_symlink_but_no_live_one(tmp_path: Path) -> None:
 
 
 class Port:
-    """Stand-in for a port of pyserial that reads `incoming`. `waiting`: numbers of unsent bytes."""
+    """Stand-in for a port of pyserial that reads `incoming`. `waiting`: its next `out_waiting`."""
 
     def __init__(self, incoming: bytes = b"", waiting: tuple[int, ...] = ()) -> None:
         self.incoming, self.waiting = incoming, list(waiting)
@@ -239,7 +239,7 @@ def opened(monkeypatch: pytest.MonkeyPatch, port: Port) -> SerialLine:
 
 
 def test_a_flood_is_taken_in_32_reads_of_4096_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """More than the 64 KiB that a kernel keeps, and never more at once."""
+    """That is more than the 64 KiB that a kernel keeps; no call reads more."""
     port = Port(b"x" * (33 * 4096))
     line = opened(monkeypatch, port)
     assert len(line.read()) == 32 * 4096
@@ -266,7 +266,7 @@ def test_bytes_before_a_failure_are_handed_over(monkeypatch: pytest.MonkeyPatch)
         (termios.error(5, "gone"), "the device went away"),
     ],
 )
-def test_a_full_line_is_not_a_failure(
+def test_a_write_returns_false_when_full_and_raises_when_gone(
     monkeypatch: pytest.MonkeyPatch, failure: Exception, told: str | None
 ) -> None:
     port = Port()
@@ -285,7 +285,7 @@ def test_a_full_line_is_not_a_failure(
     ("waiting", "sleeps", "discarded"),
     [((), 0, False), ((9, 9), 2, False), ((9,) * 9, 9, False), ((9,) * 10, 10, True)],
 )
-def test_closing_waits_20_ms_for_last_bytes(
+def test_closing_waits_at_most_20_ms_for_last_bytes(
     monkeypatch: pytest.MonkeyPatch, waiting: tuple[int, ...], sleeps: int, discarded: bool
 ) -> None:
     slept: list[float] = []

@@ -133,7 +133,8 @@ class Way:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """A sweep, or an answered PING if `sent_ns` is not None. Times are host ns."""
+    """A sweep, or an answered PING if `sent_ns` is not None. Times are host ns; `made_ns`: of the
+    device's tick."""
 
     made_ns: int
     arrival_ns: int
@@ -210,8 +211,8 @@ def test_no_reading_looks_newer_than_it_is(way: Way) -> None:
 
 
 @pytest.mark.parametrize("drift_ppm", [-100.0, 100.0])
-def test_with_batches_a_time_is_right_to_two_milliseconds(drift_ppm: float) -> None:
-    """Drawn delays, so measured: `deploy/MEASURED.md`."""
+def test_times_of_sweeps_in_batches_are_right_to_two_milliseconds(drift_ppm: float) -> None:
+    """Delays are drawn at random, so the limits are measured ones (`deploy/MEASURED.md`)."""
     way = Way(drifts_ppm=(drift_ppm,), seed=1)
     errors_ms = np.array([too_old / MS for too_old, _ in too_old_ns(way, 120)])
     assert len(errors_ms) > 11_900
@@ -233,7 +234,7 @@ def exact(pings: int, wrong_ppm: int = 0) -> tuple[DeviceClock, int]:
 
 @pytest.mark.parametrize("tick", [0, TICK_HZ, 3 * TICK_HZ + 5000])
 def test_a_clock_that_stands_or_falls_back_raises(tick: int) -> None:
-    """Reset, or standing since the first PING or the last reading."""
+    """`tick`: that of a reset clock, of the first PING, or of the last reading."""
     clock, now_ns = exact(3)
     clock.host_ns(3 * TICK_HZ + 5000, now_ns + 5 * MS)
     with pytest.raises(ClockError, match="stands or falls back"):
@@ -261,7 +262,8 @@ def test_a_rate_wrong_by_over_500_ppm_is_doubted(wrong_ppm: int) -> None:
     assert not clock.is_doubted
 
 
-def test_a_clock_that_stood_after_a_short_ping_is_doubted() -> None:
+def test_a_device_clock_standing_20_ms_between_pings_is_doubted() -> None:
+    """The first PING took 100 ms; the second one is short, so that 20 ms show."""
     clock = DeviceClock(TICK_HZ, TICK_HZ, START_NS, START_NS + 100 * MS)
     clock.round_trip(2 * TICK_HZ, START_NS + S, START_NS + S)
     assert not clock.is_doubted
@@ -279,7 +281,7 @@ def test_a_wrong_rate_makes_no_reading_20_ms_too_new(wrong_ppm: float, seed: int
 
 
 @pytest.mark.parametrize(("wrong_ppm", "lag_ms"), [(600, 120), (3_000, 150), (10_000, 400)])
-def test_a_wrong_rate_hides_no_age_on_a_slow_line(wrong_ppm: float, lag_ms: float) -> None:
+def test_wrong_rates_make_no_reading_too_new_on_slow_lines(wrong_ppm: float, lag_ms: float) -> None:
     way = Way(batch_ms=0.0, drifts_ppm=(wrong_ppm,), lag_ms=lag_ms)
     too_old = [ns for ns, _ in too_old_ns(way, 300)]
     assert len(too_old) > 29_000
@@ -304,7 +306,7 @@ def test_no_reading_is_older_than_ten_seconds() -> None:
 
 @given(ways, st.integers(3 * S, 3600 * S), st.booleans())
 def test_a_clock_that_jumps_raises_at_once(way: Way, jump_ns: int, back: bool) -> None:
-    """A computer that slept, whose clock stood meanwhile; a counter that wraps or is reset."""
+    """Ahead: a computer slept, its clock stood meanwhile. `back`: a counter wraps or is reset."""
     clock = DeviceClock(way.tick_hz, way.tick(START_NS), START_NS, START_NS + S)
     sweeps = [event for event in events(way, 5) if event.sent_ns is None]
     for event in sweeps[:200]:
