@@ -21,7 +21,7 @@ SILENCE_PERIODS, SILENCE_MIN_NS = 10, 100_000_000
 Adapters and busy hosts delay bytes by less.
 """
 OUTAGE_NS: Final = 2_000_000_000
-"""Longest outage, ns, in which missed readings are counted; a longer one counts as one."""
+"""Longest outage, ns, in which missed readings are counted; a longer one counts as one reading."""
 WARNINGS_MAX = 8
 """Most warnings in one outage, each for another reason; the log cannot fill up."""
 

@@ -94,7 +94,7 @@ def read_csv(lines: Iterable[str]) -> Iterator[Line]:
 
 
 def read_blf(stream: BinaryIO) -> Iterator[Line]:
-    """Yield frames of a BLF file up to damage, then a line about it: later ones cannot be found."""
+    """Yield frames of a BLF file up to damage, then a line about it; later frames are not found."""
     number = 0
     try:
         for number, message in enumerate(can.BLFReader(cast(BinaryIO, _Pieces(stream))), 1):
