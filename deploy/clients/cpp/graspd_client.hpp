@@ -703,7 +703,7 @@ inline bool received(zmq::socket_t& socket, std::vector<zmq::message_t>& frames)
     return true;
 }
 
-// A request to the daemon, on its own socket, until it is answered.
+// Requests of one kind to the daemon, one at a time, on a socket of their own.
 struct Call {
     zmq::socket_t socket;
 
@@ -845,7 +845,7 @@ public:
     // Returns true if a verdict lets the hand lift.
     bool permits(const Verdict& said) const { return said || (supervised_ && said.supervised); }
 
-    // Returns true if the verdict decides, so that waiting can end.
+    // Returns true for `slip` or a verdict that permits a lift: waiting can end.
     bool is_over(const Verdict& said) const {
         return said.decision == Decision::slip || permits(said);
     }
@@ -1067,7 +1067,7 @@ private:
     // Returns true in the process that made the client, false in a fork of it.
     bool is_here() const { return link_.get_deleter().is_here(); }
 
-    // Returns the newest verdict; waits for a new message at most until `due_ns`.
+    // Returns the newest verdict, at its age now; waits for a new message until `due_ns` at most.
     Verdict next_verdict(Nanoseconds due_ns) {
         if (!is_here()) return Verdict{}.unknown({"other-process"});
         while (!drain() && wait(due_ns)) {}

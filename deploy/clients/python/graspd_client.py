@@ -962,7 +962,7 @@ class _Question:
         return bool(said) or (self._supervised and said.supervised)
 
     def is_over(self, said: Verdict) -> bool:
-        """Return True if the verdict decides, so that waiting can end."""
+        """Return True for `slip` or a verdict that permits a lift: waiting can end."""
         return said.decision == Decision.SLIP or self.permits(said)
 
     def decided(self, newest: Verdict) -> Verdict:
@@ -1103,7 +1103,7 @@ def _close_in(process: int, link: _Link) -> None:
 
 
 class _Call:
-    """A request to the daemon, on its own socket, until it is answered."""
+    """Requests of one kind to the daemon, one at a time, on a socket of their own."""
 
     def __init__(self, link: _Link, endpoint: str) -> None:
         self._link, self._endpoint = link, endpoint
