@@ -54,7 +54,7 @@ Usable = NDArray[np.bool_]
 
 
 class SpikeFilter:
-    """Removes spikes, which last for one sweep or are repeated for up to `SPIKE_SWEEPS_MAX`."""
+    """Removes spikes: of one sweep, or one count repeated for up to `SPIKE_SWEEPS_MAX` sweeps."""
 
     def __init__(self, shape: tuple[int, int]) -> None:
         """`shape` is (fingers, 24)."""

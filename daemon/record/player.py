@@ -174,7 +174,8 @@ def _in_order(recording: McapReader) -> Iterator[RecordedMessage]:
 
 
 def _called_late(held: Sequence[RecordedMessage]) -> Iterator[RecordedMessage]:
-    """Yield a `late` mark, then `held`: a reading and messages about it; nothing if it is empty."""
+    """Yield a `late` mark, which makes the verdict `stale` in the replay too, then `held`: a
+    reading and messages about it; nothing if it is empty."""
     if held:
         yield held[0]._replace(kind=Topic.LATE, payload=LATE)
     yield from held

@@ -372,7 +372,7 @@ def _moved(content: object, ahead_ns: int) -> dict[str, object]:
 
 
 def _message(content: object) -> dict[str, Any]:
-    """Return the decoded message of an entry, which may be a function that makes it."""
+    """Return the message of an entry, decoded; `content`: its JSON, or a function that makes it."""
     if callable(content):
         return cast(dict[str, Any], msgspec.to_builtins(content()))
     return cast(dict[str, Any], msgspec.json.decode(cast(bytes, content)))

@@ -104,7 +104,7 @@ class Event(msgspec.Struct, frozen=True):
 
 
 class Topic(StrEnum):
-    """First part of a topic, `<kind>.<hand>`."""
+    """Kind of a message: the first part of its topic, `<kind>.<hand>`."""
 
     # Written by the outbox:
     TACTILE = "tactile"

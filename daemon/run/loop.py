@@ -252,7 +252,7 @@ class Loop:
     def _after_skipped(
         self, skipped: Sequence[TactileReading], newest: TactileReading
     ) -> TactileReading:
-        """Count skipped readings; return `newest`, `HELD` where a finger repeats the last one."""
+        """Count the skipped; return `newest`, `HELD` where a finger repeats the last of them."""
         self._shedder.skip(len(skipped), self._clock())
         self._interrupt()
         return mark_repeats(newest, skipped[-1])

@@ -118,9 +118,9 @@ class TactileStream:
         return TactileReading(t_ns, seq, counts, faults, interrupted=interrupted)
 
     def _counts(self, values: object) -> list[int | None] | None:
-        """Return the 24 counts of a finger's `values` in a message, with None for other values.
+        """Return the 24 counts of a finger's `values` in a message, None in place of a wrong one.
 
-        None if the finger has no sensor, or not 24 values.
+        None if there are not 24, or the finger has no sensor: no values, all 0, or all 4095.
         """
         if values is None:
             self.counters.absent_fingers += 1

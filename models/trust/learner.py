@@ -181,7 +181,8 @@ class Learner:
 
 
 def of_format_2(state: LearnerState) -> LearnerState:
-    """Convert a state from format 2, which held the result of `at_told`. Raises `ValueError`."""
+    """Convert a state of format 2, whose mean and covariance are those that `Learner.at_told`
+    returns. Raises `ValueError`."""
     mean, grasps = (np.frombuffer(each, "<f8") for each in (state.mean, state.grasps))
     size, count = len(mean), min(state.outcomes, GRASPS_MAX) if state.grasps else 0
     residual = Residual(grasps.reshape(count, -1) if count else np.empty((0, size - 2)))

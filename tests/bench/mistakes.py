@@ -86,7 +86,7 @@ def _nodes(
 ) -> Iterator[tuple[ast.expr | ast.stmt, ast.stmt]]:
     """Yield each node below `parent` that may be changed, and the statement around it.
 
-    Leaves out annotations, decorators and messages.
+    Leaves out annotations, decorators, formatted strings and calls of the log.
     """
     for name, value in ast.iter_fields(parent):
         if name in ("annotation", "returns", "decorator_list"):

@@ -281,7 +281,7 @@ def test_a_pickled_recording_error_keeps_text_and_fields(tmp_path: Path) -> None
     assert (str(again), vars(again)) == (str(raised.value), vars(raised.value))
 
 
-def test_a_changed_file_is_refused_at_unpickling(tmp_path: Path) -> None:
+def test_a_model_whose_file_changed_is_refused_at_unpickling(tmp_path: Path) -> None:
     path = tmp_path / "own.onnx"
     path.write_bytes(zoo.find("mlp").read_bytes())
     kept = pickle.dumps(graspd.load(path))

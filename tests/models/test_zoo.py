@@ -68,7 +68,7 @@ def test_up_to_four_repaired_dead_electrodes_cost_under_two_points() -> None:
             assert dead[number, "at 0"]["known"] > study["sound"] - 0.02
 
 
-def test_the_contract_of_cnn1_names_its_tables_and_count_ranges(bts3_dir: Path) -> None:
+def test_the_card_of_cnn1_describes_the_tables_of_its_training(bts3_dir: Path) -> None:
     columns: list[NDArray[np.int64]] = []
     for stated in CARD["contract"]["datasets"]:
         path = bts3_dir / f"{stated['name']}.csv"

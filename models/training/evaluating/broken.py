@@ -37,11 +37,13 @@ def broken_study(system: System, grasps: Grasps, seed: int) -> dict[str, Any]:
 
     `grasps` have only the system's fingers. Raises `TooFewGraspsError`.
 
-    Returns F1 (0..1, slip positive) `sound`, and after false repairs `sound_repaired`;
-    `false_alarms`, the fraction of sound readings with such a repair; `grasps`, their number; and a
-    list, `broken`, with a dict for each of `KINDS` (`reads`) and each `number` of electrodes broken
-    at random places: F1 `unnoticed`, F1 with all of them repaired (`known`), F1 with those repaired
-    that their values show (`found`), and the fraction of the broken ones so shown (`detected`).
+    Returns `grasps`, the number judged, and F1, 0..1, slip positive: `sound`, as read;
+    `sound_repaired`, after a search for broken electrodes repaired what it found, all falsely.
+    `false_alarms`: fraction of the grasps so repaired.
+
+    `broken`: a dict for each of `KINDS` (`reads`) and each `number` of electrodes broken at random
+    places. F1 `unnoticed`: none repaired; `known`: all of them repaired; `found`: those repaired
+    that the search finds. `detected`: fraction of the broken ones that it finds.
     """
     folds = [
         _Fold(system, grasps, out, fold_seed(seed, fold))

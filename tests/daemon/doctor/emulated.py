@@ -183,7 +183,7 @@ def asked(folder: Path, text: str, *options: str) -> CompletedProcess[str]:
 
 
 def look(folder: Path, text: str) -> list[dict[str, str]]:
-    """Return the doctor's findings that are not ok, nor `slow`: a busy computer slows the twin."""
+    """Return the doctor's findings on the scene `text`, without ok and `slow` (a busy computer)."""
     result = asked(folder, text, "--json")
     told = [f for f in json.loads(result.stdout)["findings"] if f["level"] != "ok"]
     assert result.returncode == int("error" in {finding["level"] for finding in told})

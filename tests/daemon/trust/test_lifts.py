@@ -102,7 +102,7 @@ class Model:
         return status
 
     def may_report(self, lift: Lift, peer: Peer) -> bool:
-        """True for the owner, by any connection, and the last lifter if it is of the same user."""
+        """True for the owner, by any connection; for the last lifter if no other user owns it."""
         names = [each and (each.routing_id[:16], each.credential) for each in (lift.owner, peer)]
         is_last = self.lifter and (self.lifter.routing_id[:16], self.lifter.credential) == names[1]
         is_heir = lift.owner is None or lift.owner.credential == peer.credential

@@ -151,7 +151,7 @@ def told(conversation: Conversation, serials: tuple[str, ...], now_ns: int) -> N
 
 def greeted(about: Hello | None = None, sensors: Sequence[str] | None = None) -> Conversation:
     """A conversation, before START, whose bridge has answered with the HELLO `about`; None:
-    `hello(0)`."""
+    `hello(0)`. `sensors`: as for `Conversation`."""
     conversation = opened(40, sensors)
     for _ in range(2):  # the serial numbers are believed when they are told again
         if conversation.hello is None and conversation.link.state is LinkState.GREETING:

@@ -87,7 +87,8 @@ def unframe(encoded: bytes) -> tuple[int, bytes] | None:
 
 
 def judged(stream: bytes) -> tuple[list[str], int]:
-    """The host's frames in a stream, as the probe prints them, and the number of other pieces."""
+    """The sound frames of a host in a stream, as the probe prints them, and the number of other
+    pieces between zeros."""
     found, errors = [], 0
     for encoded in stream.split(b"\0")[:-1]:
         if not encoded:

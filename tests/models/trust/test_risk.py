@@ -53,7 +53,7 @@ def test_over_many_lifts_the_slip_share_nears_the_allowed_one(alpha: float) -> N
         assert rule.slips / rule.lifts > 0.8 * alpha
 
 
-def test_the_threshold_rises_with_outcomes_and_falls_with_the_budget() -> None:
+def test_outcomes_raise_the_threshold_and_a_spent_budget_lowers_it() -> None:
     rule = risk(0.05)
 
     def probability() -> float:
