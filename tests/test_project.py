@@ -81,6 +81,7 @@ def without_links(folder: Path) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("source", [unpacked_sdist, without_links])
 def test_a_wheel_is_the_same_from_any_copy_of_source(
     source: Callable[[Path], Path], tmp_path: Path

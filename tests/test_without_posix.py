@@ -91,6 +91,7 @@ def test_without_posix_only_modules_that_need_linux_fail_to_import() -> None:
     assert set(refused.split()) == expected
 
 
+@pytest.mark.slow
 def test_commands_print_the_same_without_posix(
     short: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from msgspec.structs import replace
 
 from graspd.biotac import electrode_columns
@@ -73,6 +74,7 @@ def test_seeding_from_a_table_teaches_but_counts_no_lifts(tmp_path: Path) -> Non
     assert (told["outcomes"], told["lifts"]) == (learned.learner.outcomes, 0)
 
 
+@pytest.mark.slow
 def test_seeding_from_a_stream_keeps_the_sensors_resting_counts(tmp_path: Path) -> None:
     """Forty grasps hold and slip in turn; their outcomes end the warm-up."""
     counts = [row.counts for row in ROWS[:40]]

@@ -180,6 +180,7 @@ def test_a_port_that_fails_to_open_is_reported_by_cause(
     assert finding["cause"] == cause
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", LINKS)
 def test_a_healthy_twin_has_no_finding_in_fifteen_minutes(kind: str, tmp_path: Path) -> None:
     sweeps, hand = int(LOOK_S * HAND_HZ), Hand(HAND_HZ)

@@ -139,6 +139,7 @@ def test_ask_tell_on_tcp_without_keys_is_refused(tmp_path: Path) -> None:
         scene_of(tmp_path, ask={"endpoint": "tcp://127.0.0.1:5555", "tell": ["root"]})
 
 
+@pytest.mark.slow
 def test_after_a_restart_only_the_asker_may_report_the_outcome(
     tmp_path: Path, peers: Peers
 ) -> None:
