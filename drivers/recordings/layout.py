@@ -24,6 +24,7 @@ from graspd.drivers.recordings.values import (
     is_clock,
     is_outcome,
     number_of,
+    outcome_of,
     problem_with,
     time_of,
 )
@@ -318,11 +319,11 @@ def _timed(rows: _Rows, column: TimeColumn, read_as: ReadAs | None) -> Layout:
 
 def are_labelled(cells: Iterable[tuple[str, str]]) -> bool:
     """Return True if each pair is an object and an outcome, and both outcomes occur."""
-    outcomes = set[str]()
+    outcomes = set[bool | None]()
     for name, outcome in cells:
         if not name.strip() or not is_outcome(outcome):
             return False
-        outcomes.add(outcome)
+        outcomes.add(outcome_of(outcome))
     return len(outcomes) > 1
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from graspd.drivers.base import RecordingError
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
 from graspd.drivers.recordings.csv_rows import read_rows
-from graspd.drivers.recordings.layout import ReadAs, layout_of
+from graspd.drivers.recordings.layout import ReadAs, are_labelled, layout_of
 from tests.drivers.recordings.tables import (
     FINGERS,
     stream,
@@ -142,6 +142,14 @@ def test_repeated_readings_of_grasps_need_read_as_table(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="240 of 240 rows nearly repeat another"):
         layout(content, tmp_path)
     assert not layout(content, tmp_path, "table")
+
+
+@pytest.mark.parametrize(
+    ("cells", "both"),
+    [(["0", "1"], True), (["stable", "True"], True), (["0", "stable"], False), (["1", ""], False)],
+)
+def test_rows_are_labelled_if_lifts_ended_in_both_ways(cells: Sequence[str], both: bool) -> None:
+    assert are_labelled(("mug", cell) for cell in cells) == both
 
 
 def test_few_repeated_grasps_need_labels_or_read_as_table(tmp_path: Path) -> None:
