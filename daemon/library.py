@@ -27,7 +27,13 @@ from graspd.daemon.run.unjudged import Unjudged
 from graspd.daemon.scene import SceneError
 from graspd.daemon.session import file as session_file
 from graspd.drivers.base import JointReading, RecordingError
-from graspd.drivers.recordings.columns import OBJECT, ONE_ROW, SLIPPED, finger_column, time_column
+from graspd.drivers.recordings.columns import (
+    OBJECT,
+    SLIPPED,
+    finger_column,
+    problem_of_fingers,
+    time_column,
+)
 from graspd.drivers.recordings.kinds import Kind, files_of, kind_of_all, refuse_options
 from graspd.drivers.recordings.layout import BLOCK_ROWS, ReadAs, are_labelled, problem_of_sweeps
 from graspd.drivers.recordings.values import BLANK
@@ -196,9 +202,10 @@ def _refuse_fingers_by_row(table: Any, names: Sequence[str]) -> None:  # noqa: A
     if column is None or len(fingers_of(names)) > 1:
         return
     cells = np.asarray(table[column[1]], dtype=object).tolist()
-    named = sorted({str(cell).strip().lower() for cell in cells}.intersection(FINGERS))
-    if len(named) > 1:
-        raise ValueError(f"the column {column[1]}: has rows of {' and of '.join(named)}: {ONE_ROW}")
+    named = {str(cell).strip().lower() for cell in cells}.intersection(FINGERS)
+    problem = problem_of_fingers(named)
+    if problem is not None:
+        raise ValueError(f"the column {column[1]}: {problem}")
 
 
 def _are_labelled(table: Any) -> bool:  # noqa: ANN401

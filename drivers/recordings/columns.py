@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -268,6 +268,12 @@ def finger_column(names: Sequence[str]) -> tuple[int, str] | None:
     """Return place and name of the first column that may say of which finger a row is."""
     found = ((place, name) for place, name in enumerate(names) if _OF_A_FINGER.fullmatch(name))
     return next(found, None)
+
+
+def problem_of_fingers(named: Iterable[str]) -> str | None:
+    """Return why rows that are named so are not of one finger; None: one name at most."""
+    first = sorted(named)[:2]
+    return f"has rows of {' and of '.join(first)}: {ONE_ROW}" if len(first) > 1 else None
 
 
 def _written(example: str, finger: str) -> str:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from graspd.biotac import FINGERS
 from graspd.drivers.base import ANGLE_MAX_RAD, RecordingError
 from graspd.drivers.recordings.cells import Cells
-from graspd.drivers.recordings.columns import ONE_ROW, Columns, TimeColumn
+from graspd.drivers.recordings.columns import Columns, TimeColumn, problem_of_fingers
 from graspd.drivers.recordings.kinds import open_recording
 from graspd.drivers.recordings.values import (
     count_of,
@@ -179,10 +179,10 @@ class _Rows:
 
     def refuse_fingers_by_row(self) -> None:
         """Raise if the rows so far are of several fingers, and would be read as those of one."""
-        if self.columns.finger is not None and 1 < len(self._named) <= len(FINGERS):
-            one, other = sorted(self._named)[:2]
-            problem = f"has rows of {one} and of {other}: {ONE_ROW}"
-            raise RecordingError(self.path, problem, column=self.columns.finger[1])
+        if self.columns.finger is not None and len(self._named) <= len(FINGERS):
+            problem = problem_of_fingers(self._named)
+            if problem is not None:
+                raise RecordingError(self.path, problem, column=self.columns.finger[1])
 
     def refuse_fingers_below(self) -> None:
         """Read on to the end, if a column may name fingers, and raise if there are several."""
