@@ -70,9 +70,9 @@ def sync_folder(path: Path) -> None:
     """Make changes of file names in a folder survive a power cut, where the system can do that."""
     if not hasattr(os, "O_DIRECTORY"):
         return
-    folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        with suppress(OSError):
+    with suppress(OSError):
+        folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
             os.fsync(folder)
-    finally:
-        os.close(folder)
+        finally:
+            os.close(folder)
