@@ -97,6 +97,7 @@ def test_an_unopened_driver_reports_closed_and_raises_on_reading(
     assert not driver.exhausted
     assert driver.describe()["link"] == Fact("closed", LinkCause.UNKNOWN)
     assert driver.serials == {}
+    assert not any(driver.counters.as_dict().values())
     with pytest.raises(RuntimeError, match="not open"):
         driver.read_ready()
     driver.close()
