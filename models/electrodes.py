@@ -26,8 +26,8 @@ unrepaired costs 3 to 40 points.
 CONTRADICTING_MAX = 2
 """Most electrodes, besides those known to be broken, that may contradict the others.
 
-With this limit 99 % of the held-out grasps are judged. Of readings whose electrodes each come from
-another grasp of the day, none has so few for `cnn1`, and a quarter for `small-session`; with a
+With this limit 99 % of the held-out grasps are judged. A quarter of the readings whose electrodes
+each come from another grasp of the day have so few for `small-session`, none for `cnn1`; with a
 limit of four, two thirds or more would.
 """
 BROKEN_MAX = 12

@@ -69,7 +69,7 @@ COMMANDS = (
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
+@pytest.mark.timeout(3600)
 @pytest.mark.parametrize("place", PLACES)
 def test_no_command_ends_in_a_traceback_on_unusable_paths(tmp_path: Path, place: str) -> None:
     can_lose = os.geteuid() == 0 and shutil.which(WITHOUT_RIGHTS[0])
