@@ -103,7 +103,9 @@ class GraspModel:
 
         `counts`: shape (n, fingers, 24), or a table with columns such as `ff_biotac_1`. NaN, or a
         masked or missing value, is an electrode that is known to be broken, as is one at 0 or 4095.
-        A row is NaN if the daemon would refuse to judge it. Threads may share a model.
+        A row is NaN if the daemon would refuse to judge it, or if the sensor of a finger stood
+        still: it has the counts of another row in which other fingers differ. Threads may share a
+        model.
 
         `session`, for models that need one: grasps of the same sensors on the same day, like
         `counts` and without outcomes, or the file of a session that a daemon has kept.
@@ -123,8 +125,8 @@ class GraspModel:
         probabilities = np.full((len(judged), 2), np.nan)
         with self._turn():
             self._begin(session, read_as)
-            for row, values in enumerate(judged):
-                p_slip = self._judge.judge(self._examine(values)).p_slip
+            for row in np.flatnonzero(~_stand_still(judged)):
+                p_slip = self._judge.judge(self._examine(judged[row])).p_slip
                 if p_slip is not None:
                     probabilities[row] = 1.0 - p_slip, p_slip
         return probabilities
@@ -162,7 +164,8 @@ class GraspModel:
         if isinstance(session, str | os.PathLike):
             session_file.restore(Path(session), self.fingers, calibration)
         elif session is not None:
-            for values in _grasps(session, self.fingers, read_as):
+            grasps = _grasps(session, self.fingers, read_as)
+            for values in grasps[~_stand_still(grasps)]:
                 examined = self._examine(values)
                 self._judge.observe(examined, self._judge.judge(examined))
         if not calibration.calibrated:
@@ -179,6 +182,11 @@ def _grasps(
     given: ArrayLike, fingers: Sequence[Finger], read_as: ReadAs | None
 ) -> NDArray[np.float64]:
     """Return counts of shape (n, fingers, 24). Raises `ValueError`, also for a table of sweeps."""
+    if read_as not in (None, "table"):
+        raise ValueError(
+            f"read_as={read_as!r}: a GraspModel judges grasps; graspd.judge(table, "
+            "read_as='stream', rate_hz=...) judges sweeps"
+        )
     time_of_sweeps = _time_of(given)
     if time_of_sweeps is not None:
         raise ValueError(
@@ -192,8 +200,21 @@ def _grasps(
         blocks = np.array_split(rows, range(BLOCK_ROWS, len(rows), BLOCK_ROWS))
         problem = problem_of_sweeps(blocks, read_as, labelled=_are_labelled(given))
         if problem is not None:
-            raise ValueError(f"the table: {_in_arguments(problem)} (graspd.judge judges sweeps)")
+            raise ValueError(f"the table: {_in_arguments(problem)} graspd.judge judges sweeps")
     return counts
+
+
+def _stand_still(counts: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return True for rows, shape (n,), in which a finger has the counts of a row with other counts
+    of another finger; a live sensor's noise never repeats. `counts`: shape (n, fingers, 24)."""
+    still = np.zeros(len(counts), np.bool_)
+    known = np.nan_to_num(counts)
+    _, whole = np.unique(known, axis=0, return_inverse=True)
+    for finger in range(known.shape[1]):
+        _, sweep = np.unique(known[:, finger], axis=0, return_inverse=True)
+        pairs = np.unique(np.column_stack((sweep.ravel(), whole.ravel())), axis=0)
+        still |= (np.bincount(pairs[:, 0]) > 1)[sweep.ravel()]
+    return still
 
 
 def _refuse_fingers_by_row(table: Any, names: Sequence[str]) -> None:  # noqa: ANN401

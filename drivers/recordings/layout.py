@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from itertools import chain, islice, pairwise
 from operator import itemgetter
 from pathlib import Path
-from typing import BinaryIO, Final, Literal
+from typing import BinaryIO, Final, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,6 +119,8 @@ def survey(
     rate_hz: float | None = None,
 ) -> Layout:
     """Return the layout of an opened file as `layout_of` does, and rewind the file."""
+    if read_as not in (None, *get_args(ReadAs)):
+        raise RecordingError(path, f"is read as 'table' or 'stream', not as {read_as!r}")
     cells = Cells(path, file)
     columns = Columns.of(path, cells.names, fingers, cells.header_line)
     rows = _Rows(path, columns, cells)
@@ -348,7 +350,7 @@ def problem_of_sweeps(
     number, near = len(apart), int((apart <= NEAR_COUNTS).sum())
     far = int((apart > STEP_COUNTS).sum())
     between = number - near - far
-    is_known = labelled or read_as is not None
+    is_known = labelled or read_as == "table"
     near_max, alike_max = (NEAR_SHARE_MAX, ALIKE_SHARE_MAX) if is_known else DOUBTED_SHARES
     if near > near_max * number:
         problem = f"{near} of {number} rows nearly repeat another"

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from enum import StrEnum
+from itertools import combinations
 from typing import TYPE_CHECKING, Protocol, Self
 
 import msgspec
@@ -27,6 +28,11 @@ FLAT_SPREAD_COUNTS = 70.0
 """Smallest standard deviation over the electrodes of a finger that touches and works, counts.
 
 It is about half of 148, the smallest of 4682 real grasps.
+"""
+TWINS_MIN = 20
+"""Fewest equal counts, of 24, by which two fingers are one sensor that was read twice.
+
+In 4682 real grasps at most two are equal.
 """
 TINY = 1e-12  # for a probability of zero, which has no logarithm
 
@@ -138,6 +144,8 @@ class GraspJudge:
         values = counts.astype(np.float64)
         if _is_flat(values, broken):
             return Examined(counts, Refusal.FLAT)
+        if _are_twins(counts):
+            return Examined(counts, Refusal.NEVER_SEEN)
         if session is not None:
             values = session.to_training(values)
         if broken is None:
@@ -221,6 +229,12 @@ def _as_read(
     """
     expected = values if session is None else session.from_training(values)
     return np.where(broken, np.clip(expected, 0.0, COUNT_MAX), counts)
+
+
+def _are_twins(counts: NDArray[np.uint16]) -> bool:
+    """Return True if two fingers of counts, shape (fingers, 24), have the same sensor's."""
+    equals = (one == other for one, other in combinations(counts, 2))
+    return any(np.count_nonzero(equal) >= TWINS_MIN for equal in equals)
 
 
 def _is_flat(values: NDArray[np.float64], broken: NDArray[np.bool_] | None) -> bool:

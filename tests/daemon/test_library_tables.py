@@ -104,8 +104,22 @@ def test_sweeps_without_times_are_refused_as_grasps() -> None:
             list(judge(sweeps))
         with pytest.raises(ValueError, match="they change as sweeps of a stream do"):
             list(judge(sweeps, read_as="table"))
+    as_stream: Any = "stream"
+    with pytest.raises(ValueError, match="'stream': a GraspModel judges grasps"):
+        model.predict(sweeps[:9], read_as=as_stream)
     again = sweeps[:1].loc[[0, 0]]
     assert len(model.predict(again, read_as="table")) == 2
+
+
+def test_grasps_of_a_finger_that_stands_still_are_unknown(counts: NDArray[np.float64]) -> None:
+    model, half = graspd.load("mlp"), len(counts) // 2
+    told = model.predict(counts)
+    assert model.predict(np.concatenate((counts, counts)))[len(counts) :].tolist() == told.tolist()
+    counts[half:, 2] = counts[0, 2]
+    still = model.predict(counts)
+    assert {still[0], *still[half:]} == {"unknown"}
+    assert still[1:half].tolist() == told[1:half].tolist()
+    assert set(told) == {"stable", "slip", "unknown"}
 
 
 def test_a_table_with_rows_of_different_fingers_is_refused(counts: NDArray[np.float64]) -> None:

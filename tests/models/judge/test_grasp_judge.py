@@ -45,6 +45,17 @@ def session(temperature: float) -> SessionCalibration:
     return SessionCalibration(takes, np.ones((3, 24)), np.ones((3, 24)))
 
 
+@pytest.mark.parametrize(("equal", "refusal"), [(19, None), (20, Refusal.NEVER_SEEN)])
+def test_two_fingers_with_the_counts_of_one_sensor_are_refused(
+    equal: int, refusal: Refusal | None
+) -> None:
+    """Of two live sensors at most 2 counts of 24 are equal."""
+    judge = judge_of(FakeModel())
+    counts = COUNTS.copy()
+    counts[2, :equal] = counts[0, :equal]
+    assert judge.examine(counts).refusal == refusal
+
+
 @pytest.mark.parametrize("p_slip", [0.0, 0.01, 0.2, 0.5, 0.8, 0.99, 1.0])
 def test_a_margin_is_the_finite_log_odds_of_slip(p_slip: float) -> None:
     opinion = judge_of(FakeModel(p_slip)).judge(Examined(COUNTS))
