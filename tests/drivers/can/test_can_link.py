@@ -10,6 +10,7 @@ import threading
 import time
 
 import can
+import numpy as np
 import pytest
 
 from graspd.drivers.base import DriverError, TactileReading
@@ -165,76 +166,56 @@ def test_a_silent_board_is_down_and_comes_back(monkeypatch: pytest.MonkeyPatch) 
 
 
 @pytest.mark.parametrize(
-    ("stamp_s", "age_ns"), [(100.0, 500_000_000), (100.5, 0), (101.0, 0)], ids=str
+    ("interface", "steps", "expected"),
+    [
+        # A stamp after now comes from a wall clock that was set back since, and counts as now.
+        ("virtual", [(1000, 100_500, (100.0,))], [(500, 500)]),
+        ("virtual", [(1000, 100_500, (100.5, 101.0))], [(1000, 1000)] * 2),
+        # The wall clock is read 20 ms late the second time.
+        (
+            "virtual",
+            [(1010, 94_010, (94.001,)), (1020, 94_040, (94.004,)), (1030, 94_030, (94.007,))],
+            [(1001, 1001), (1001, 1001), (1007, 1007)],
+        ),
+        # Without a stamp a frame came since the bus was last empty.
+        (
+            "robotell",
+            [(1020, 0, (0.0,)), (1030, 0, ()), (1050, 0, (0.0, 0.0))],
+            [(1000, 1020), (1030, 1050), (1030, 1050)],
+        ),
+        # Rising stamps of a server date frames by the quickest delay.
+        (
+            "socketcand",
+            [(1010, 0, (100.0,)), (1050, 0, (100.01,)), (1060, 0, (99.0,))],
+            [(1010, 1010), (1020, 1020), (1050, 1060)],
+        ),
+    ],
 )
-def test_a_frame_is_as_old_as_its_stamp(
-    monkeypatch: pytest.MonkeyPatch, stamp_s: float, age_ns: int
+def test_each_interfaces_stamps_date_frames(
+    interface: str,
+    steps: list[tuple[int, int, tuple[float, ...]]],
+    expected: list[tuple[int, int]],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A stamp after now comes from a wall clock that was set back since, and counts as now."""
-    received = message(b"\0", 0x7FF)
-    received.timestamp = stamp_s
-    stand_in(monkeypatch, lambda: ScriptedBus([received]))
-    bus = CanBus("virtual", "x", None, Clock(7_000_000_000), Clock(100_500_000_000))
+    """`steps`: time and wall time of a reading, ms, and the stamps that it finds, s. `expected`:
+    the earliest and latest time at which each frame may have arrived, ms."""
+    scripted, clock, wall_clock = ScriptedBus(), Clock(1_000 * MS), Clock(94_000 * MS)
+    monkeypatch.setattr("graspd.drivers.can.bus.open_bus", lambda *_, **__: scripted)
+    server: dict[str, str | int] = {"host": "127.0.0.1", "port": 1}
+    options = server if interface == "socketcand" else {}
+    bus = CanBus(interface, "x", None, clock, wall_clock, options)
     bus.open()
-    ((_, t_ns, until_ns),) = bus.drain()
-    assert t_ns == until_ns == 7_000_000_000 - age_ns
+    found = []
+    for now_ms, wall_ms, stamps_s in steps:
+        clock.now_ns, wall_clock.now_ns = now_ms * MS, wall_ms * MS
+        for stamp_s in stamps_s:
+            received = message(b"\0", 0x7FF)
+            received.timestamp = stamp_s
+            scripted.script.append(received)
+        found += [(since_ns / MS, until_ns / MS) for _, since_ns, until_ns in bus.drain()]
+    assert np.array(found) == pytest.approx(np.array(expected), abs=0.1)
     bus.close()
     assert bus.drain() == []
-
-
-def test_frames_stay_in_order_if_clocks_are_read_late(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The wall clock is read 20 ms late the second time."""
-    scripted, clock, wall_clock = ScriptedBus(), Clock(7_000_000_000), Clock(100_000_000_000)
-    stand_in(monkeypatch, lambda: scripted)
-    bus = CanBus("virtual", "x", None, clock, wall_clock)
-    bus.open()
-    made = []
-    for stamp_s, late_ns in ((100.001, 0), (100.004, 20_000_000), (100.007, 0)):
-        clock.now_ns += 10_000_000
-        wall_clock.now_ns = clock.now_ns + 93_000_000_000 + late_ns
-        received = message(b"\0", 0x7FF)
-        received.timestamp = stamp_s
-        scripted.script.append(received)
-        made += [t_ns for _, t_ns, _ in bus.drain()]
-    assert made == [7_001_000_000, 7_001_000_000, 7_007_000_000]
-    bus.close()
-
-
-def test_an_unstamped_frame_arrived_since_the_bus_was_last_empty(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    scripted, clock = ScriptedBus(), Clock(1_000)
-    stand_in(monkeypatch, lambda: scripted)
-    bus = CanBus("robotell", "x", None, clock, Clock(0))
-    bus.open()
-    doubts = []
-    for now_ns, frames in ((2_000, 1), (3_000, 0), (5_000, 2)):
-        clock.now_ns = now_ns
-        scripted.script += [message(b"\0", 0x7FF)] * frames
-        doubts += [(t_ns, until_ns) for _, t_ns, until_ns in bus.drain()]
-    assert doubts == [(1_000, 2_000), (3_000, 5_000), (3_000, 5_000)]
-    bus.close()
-
-
-def test_rising_socketcand_stamps_date_frames_by_the_quickest_delay(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    scripted, clock = ScriptedBus(), Clock(1_000 * MS)
-    monkeypatch.setattr("graspd.drivers.can.bus.open_bus", lambda *_, **__: scripted)
-    bus = CanBus("socketcand", "x", None, clock, Clock(0), {"host": "127.0.0.1", "port": 1})
-    bus.open()
-    arrived = []
-    for now_ms, stamp_s in ((1010, 100.0), (1050, 100.01), (1060, 99.0)):
-        clock.now_ns = now_ms * MS
-        received = message(b"\0", 0x7FF)
-        received.timestamp = stamp_s
-        scripted.script.append(received)
-        arrived += [(since_ns / MS, now_ns / MS) for _, since_ns, now_ns in bus.drain()]
-    for found, expected in zip(arrived, [(1010, 1010), (1020, 1020), (1050, 1060)], strict=True):
-        assert found == pytest.approx(expected, abs=0.1)
-    bus.close()
 
 
 LIMIT_S = 60.0
