@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import signal
-import subprocess
 import sys
 from pathlib import Path
 
@@ -14,6 +13,7 @@ import pytest
 from graspd.drivers.recordings.csv_player import DEMO_DAY
 from tests.daemon.processes import TIMEOUT_S, start
 from tests.kit.inside import graspd
+from tests.kit.programs import ran
 from tests.ports import free_port
 
 WITHOUT = (sys.executable, str(Path(__file__).with_name("without_posix.py")))
@@ -65,13 +65,7 @@ def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def without(*arguments: object) -> tuple[int, str, str]:
     """Run graspd with `arguments` without POSIX; return exit code, stdout without times, stderr."""
-    done = subprocess.run(
-        [*WITHOUT, *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=TIMEOUT_S,
-        check=False,
-    )
+    done = ran(*WITHOUT, *arguments)
     return done.returncode, TIMES.sub("", done.stdout), done.stderr
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 import sys
 import tempfile
 import time
@@ -18,6 +17,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from tests.kit.programs import ran
 
 if TYPE_CHECKING:
     from graspd.daemon.assembly.parts import Parts
@@ -32,7 +33,6 @@ ASK_EVERY = 20
 """Readings between two questions, if the scene judges a grasp on request only."""
 SILENCE_NS = 100_000_000
 MIB = 1024
-TIMEOUT_S = 120.0
 TITLES = (
     "scene",
     "memory, MiB (over Python's own)",
@@ -50,15 +50,8 @@ readings and of those that the model judged, sorted."""
 def measure(scene: Path) -> Footprint:
     """Measure a scene in a process of its own, for about a second. Raises `RuntimeError`."""
     with tempfile.TemporaryDirectory(prefix="graspd-") as folder:
-        result = subprocess.run(
-            [sys.executable, "-m", "tests.bench.footprint", "--here", scene.absolute(), folder],
-            cwd=EXAMPLES.parents[1],
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            timeout=TIMEOUT_S,
-            check=False,
-        )
+        words = ("-m", "tests.bench.footprint", "--here", scene.absolute(), folder)
+        result = ran(sys.executable, *words, cwd=EXAMPLES.parents[1])
     if result.returncode:
         raise RuntimeError(f"{scene}: {result.stderr}")
     return dict(json.loads(result.stdout))

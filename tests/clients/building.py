@@ -92,14 +92,6 @@ def sleep_at_will(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return slept
 
 
-def asked(program: Path, *words: object, typed: str = "") -> subprocess.CompletedProcess[str]:
-    """Run a program to its end, with `words` as arguments and `typed` as its input."""
-    command = [str(program), *map(str, words)]
-    return subprocess.run(
-        command, capture_output=True, text=True, timeout=200, check=False, input=typed
-    )
-
-
 def compiled_probe(name: str = "probe") -> Path:
     """Return the program of `name`.cpp in this folder, compiled with sanitizers."""
     skip_unless_it_can_be_compiled()

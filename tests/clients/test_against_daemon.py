@@ -17,9 +17,10 @@ from deploy.clients.python.graspd_client import Client, Keys, Outcome, Verdict
 from graspd.daemon.publish.keys import make
 from graspd.daemon.publish.messages import decode_outcome
 from tests.clients.bench import Daemon, free_endpoint
-from tests.clients.building import asked, sleep_at_will
+from tests.clients.building import sleep_at_will
 from tests.clients.either import Connect
 from tests.clients.messages import frames, verdict
+from tests.kit.programs import ran
 from tests.kit.waiting import wait_until
 
 pytestmark = pytest.mark.slow
@@ -84,7 +85,7 @@ def test_early_verdicts_allow_lifts_unless_stillness_is_required(
 
             wait_until(may_i_lift)
         words = "--still", 240, daemon.endpoint, 1.0
-        wait_until(lambda: "\nlift after" in asked(lift_gate, *words).stdout)
+        wait_until(lambda: "\nlift after" in ran(lift_gate, *words).stdout)
 
 
 def test_a_lifts_outcome_is_published_once_and_contradictions_are_refused(
@@ -111,7 +112,7 @@ def test_a_lifts_outcome_is_published_once_and_contradictions_are_refused(
         wait_until(may_i_lift)
         lifted_on = lifted[-1]
         tell = "--tell", daemon.endpoint, daemon.ask_endpoint, lifted_on.boot_id, lifted_on.grasp
-        refused = asked(lift_gate, *tell, "stable")
+        refused = ran(lift_gate, *tell, "stable")
         assert (refused.returncode, refused.stdout[:9]) == (1, "not yours")
         for _ in range(2):
             assert graspd.tell(lifted_on, Outcome.SLIPPED, "mug", wait_s=10.0)
@@ -131,7 +132,7 @@ def test_a_lifts_outcome_is_published_once_and_contradictions_are_refused(
 def test_lift_gate_reports_the_typed_outcome_of_its_lift(lift_gate: Path, tmp_path: Path) -> None:
     with Daemon(tmp_path, whole_grasps=True) as daemon:
         words = "--supervised", daemon.endpoint, 1.0, daemon.ask_endpoint, "mug"
-        wait_until(lambda: asked(lift_gate, *words, typed="slipped").stdout.endswith("taken\n"))
+        wait_until(lambda: ran(lift_gate, *words, typed="slipped").stdout.endswith("taken\n"))
 
 
 def test_after_a_daemons_kill_verdicts_are_unknown_until_its_restart(tmp_path: Path) -> None:
@@ -181,7 +182,7 @@ def test_only_clients_with_keys_get_verdicts(lift_gate: Path, tmp_path: Path) ->
         with watching(lift_gate, endpoint, public, own_secret) as watch:
             line_with(watch, "stable", "slip")
         assert stranger.verdict(0.2).reasons == ("no-message",)
-        assert asked(lift_gate, endpoint, 0.3).stdout.startswith("unknown [ no-message ]")
+        assert ran(lift_gate, endpoint, 0.3).stdout.startswith("unknown [ no-message ]")
     with pytest.raises(ValueError, match="no secret key"):
         Keys.load(public, own_public)
 
@@ -212,7 +213,7 @@ def test_the_cpp_client_forgets_messages_after_the_computer_slept(
     "words", [[], ["ipc:///x"], ["ipc:///x", "-1"], ["nowhere", "1"], ["--watch"]]
 )
 def test_lift_gate_exits_with_2_on_a_wrong_command_line(lift_gate: Path, words: list[str]) -> None:
-    result = asked(lift_gate, *words)
+    result = ran(lift_gate, *words)
     assert result.returncode == 2
     assert "lift_gate" in result.stdout + result.stderr
 

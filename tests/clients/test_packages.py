@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from tests.clients.building import CPP, asked, skip_unless_it_can_be_compiled
+from tests.clients.building import CPP, skip_unless_it_can_be_compiled
+from tests.kit.programs import ran
 
 pytestmark = pytest.mark.slow
 
@@ -26,9 +26,7 @@ def block(language: str, first: str) -> list[str]:
 
 
 def run(*words: str | Path, **variables: str) -> str:
-    done = subprocess.run(
-        words, capture_output=True, text=True, timeout=200, check=False, env=os.environ | variables
-    )
+    done = ran(*words, env=os.environ | variables)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -57,7 +55,7 @@ def project(tmp_path: Path) -> Path:
 
 def works(program: Path, folder: Path) -> None:
     """Run the program without a daemon, and assert that it says no, and why."""
-    result = asked(program, f"ipc://{folder}/nobody", 0.1)
+    result = ran(program, f"ipc://{folder}/nobody", 0.1)
     assert result.returncode == 1, result.stderr
     assert result.stdout.startswith("unknown [ no-message ]")
 
@@ -103,12 +101,7 @@ def test_a_project_for_another_minor_version_refuses_this_package(
 ) -> None:
     lines = "\n".join(block("cmake", "cmake_minimum")).replace("0.1", "0.2")
     (project / "CMakeLists.txt").write_text(lines)
-    found = subprocess.run(
-        ["cmake", "-S", project, "-B", project / "build", f"-DCMAKE_PREFIX_PATH={prefix}"],
-        capture_output=True,
-        text=True,
-        timeout=200,
-        check=False,
-    )
+    words = ["cmake", "-S", project, "-B", project / "build", f"-DCMAKE_PREFIX_PATH={prefix}"]
+    found = ran(*words)
     assert found.returncode != 0
     assert "version: 0.1.0" in found.stderr

@@ -14,9 +14,10 @@ import pytest
 import zmq
 
 from deploy.clients.python.graspd_client import Client
-from tests.clients.building import asked, compiled_probe
+from tests.clients.building import compiled_probe
 from tests.clients.false_daemon import false_daemon
 from tests.conftest import ROOT
+from tests.kit.programs import ran
 
 HOURS_S, LIMIT_S = 1e6, 60.0
 
@@ -120,7 +121,7 @@ def test_during_a_call_another_thread_may_only_close_the_client(
 
 
 def test_cpp_survives_signals_and_refuses_after_a_fork() -> None:
-    result = asked(compiled_probe("signals"), 100)
+    result = ran(compiled_probe("signals"), 100)
     assert (result.returncode, result.stderr) == (0, "")
     assert result.stdout.splitlines() == [
         *["unknown other-process"] * 3,

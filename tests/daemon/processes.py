@@ -38,17 +38,6 @@ with zmq.Context() as context, context.socket(zmq.SUB) as socket:
 """Plain pyzmq: prints the verdicts that come at an endpoint, up to a number."""
 
 
-def graspd(*arguments: object, timeout_s: float = TIMEOUT_S) -> subprocess.CompletedProcess[str]:
-    """Run graspd with `arguments` to its end."""
-    return subprocess.run(
-        [*GRASPD, *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=timeout_s,
-        check=False,
-    )
-
-
 class Started(subprocess.Popen[str]):
     """A process that is killed, not waited for, if the test fails."""
 

@@ -8,9 +8,10 @@ import sys
 import zipfile
 from pathlib import Path
 
+from tests.kit.programs import ran
+
 DEPLOY = Path(__file__).parents[2] / "deploy"
 INSTALLER = DEPLOY / "install.sh"
-TIMEOUT_S = 200
 
 
 def wheelhouse(folder: Path, version: str, *, starts: bool = True) -> Path:
@@ -38,8 +39,7 @@ def wheelhouse(folder: Path, version: str, *, starts: bool = True) -> Path:
 
 def installer(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     """Run install.sh with `arguments`, and with this Python for its virtual environment."""
-    command = [str(part) for part in (INSTALLER, "--python", sys.executable, *arguments)]
-    return subprocess.run(command, check=False, capture_output=True, text=True, timeout=TIMEOUT_S)
+    return ran(INSTALLER, "--python", sys.executable, *arguments)
 
 
 def install(root: Path, wheels: Path, *arguments: str) -> str:
@@ -67,8 +67,7 @@ def in_a_chroot(folder: Path, script: str) -> subprocess.CompletedProcess[str]:
 
     `folder`: where the copy is mounted; it is empty before and afterwards.
     """
-    command = ["unshare", "--mount", "sh", "-euc", IN_A_CHROOT, "sh", str(folder), script]
-    return subprocess.run(command, check=False, capture_output=True, text=True, timeout=TIMEOUT_S)
+    return ran("unshare", "--mount", "sh", "-euc", IN_A_CHROOT, "sh", folder, script)
 
 
 def content(root: Path) -> dict[str, str]:
@@ -85,7 +84,4 @@ def content(root: Path) -> dict[str, str]:
 def version_below(root: Path, prefix: str = "/opt/graspd") -> str:
     """Return what the graspd installed below `root` prints as its version."""
     python = f"{root}{prefix}/venv/bin/python"
-    done = subprocess.run(
-        [python, "-I", "-m", "graspd", "--version"], capture_output=True, text=True, check=True
-    )
-    return done.stdout.strip()
+    return ran(python, "-I", "-m", "graspd", "--version", check=True).stdout.strip()

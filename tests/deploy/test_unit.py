@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import shutil
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -13,6 +12,7 @@ from graspd.daemon.scene import Scene
 from graspd.daemon.scene.drivers import SpiTactile
 from graspd.daemon.scene.scene import STATE_DIRECTORY, Hand, Realtime
 from tests.deploy.staging import DEPLOY, INSTALLER
+from tests.kit.programs import ran
 
 UNIT = DEPLOY / "systemd/graspd@.service"
 EXPOSURE_MAX_TENTHS = 25
@@ -34,11 +34,6 @@ def tool(name: str, package: str) -> str:
     return path
 
 
-def run(*command: str | Path) -> subprocess.CompletedProcess[str]:
-    words = [str(word) for word in command]
-    return subprocess.run(words, check=False, capture_output=True, text=True, timeout=200)
-
-
 def test_systemd_understands_the_unit(tmp_path: Path) -> None:
     analyze = tool("systemd-analyze", "systemd")
     program = tmp_path / "venv/bin/graspd"
@@ -47,14 +42,14 @@ def test_systemd_understands_the_unit(tmp_path: Path) -> None:
     program.chmod(0o755)
     unit = tmp_path / UNIT.name
     unit.write_text(UNIT.read_text().replace("/opt/graspd", str(tmp_path)))
-    done = run(analyze, "verify", "--recursive-errors=no", unit)
+    done = ran(analyze, "verify", "--recursive-errors=no", unit)
     assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_the_units_security_exposure_is_below_the_limit() -> None:
     analyze = tool("systemd-analyze", "systemd")
     options = ["--offline=true", f"--threshold={EXPOSURE_MAX_TENTHS}", "--no-pager"]
-    done = run(analyze, "security", *options, UNIT)
+    done = ran(analyze, "security", *options, UNIT)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "Overall exposure level for graspd@" in done.stdout
 
@@ -62,7 +57,7 @@ def test_the_units_security_exposure_is_below_the_limit() -> None:
 def test_systemd_makes_the_user_and_its_groups(tmp_path: Path) -> None:
     sysusers = tool("systemd-sysusers", "systemd")
     (tmp_path / "etc").mkdir()
-    done = run(sysusers, f"--root={tmp_path}", DEPLOY / "sysusers.d/graspd.conf")
+    done = ran(sysusers, f"--root={tmp_path}", DEPLOY / "sysusers.d/graspd.conf")
     assert done.returncode == 0, done.stderr
     passwd = (tmp_path / "etc/passwd").read_text()
     group = (tmp_path / "etc/group").read_text()
@@ -72,9 +67,9 @@ def test_systemd_makes_the_user_and_its_groups(tmp_path: Path) -> None:
 
 def test_udev_understands_the_rules() -> None:
     udevadm = tool("udevadm", "udev")
-    if "verify" not in run(udevadm, "--help").stdout:
+    if "verify" not in ran(udevadm, "--help").stdout:
         pytest.skip("udevadm verify came with systemd 254")
-    done = run(udevadm, "verify", DEPLOY / "udev/70-graspd.rules")
+    done = ran(udevadm, "verify", DEPLOY / "udev/70-graspd.rules")
     assert done.returncode == 0, done.stdout + done.stderr
 
 
@@ -121,5 +116,5 @@ def test_the_network_file_sets_the_protocols_bit_rate() -> None:
 
 
 def test_shellcheck_finds_nothing_in_the_installer() -> None:
-    done = run(tool("shellcheck", "shellcheck"), INSTALLER)
+    done = ran(tool("shellcheck", "shellcheck"), INSTALLER)
     assert (done.returncode, done.stdout) == (0, "")

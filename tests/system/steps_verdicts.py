@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 import tempfile
 from collections import Counter
 from pathlib import Path
 from typing import Final
 
+from tests.kit.programs import ran
 from tests.system.lab import RATE_HZ, Lab, Outcome, StepError
 from tests.system.messages import Message
 from tests.system.payload import write_recording
@@ -51,10 +51,8 @@ def _replayed() -> list[float]:
     with tempfile.TemporaryDirectory() as folder:
         recording = Path(folder) / "recording.csv"
         write_recording(recording)
-        command = ["replay", "--json", "--model", CAN_MODEL, str(recording)]
-        done = subprocess.run(
-            [sys.executable, "-m", "graspd", *command], capture_output=True, text=True, check=False
-        )
+        command = ["replay", "--json", "--model", CAN_MODEL, recording]
+        done = ran(sys.executable, "-m", "graspd", *command)
     verdicts = [json.loads(line) for line in done.stdout.splitlines()]
     expected = [each["p_slip"] for each in verdicts if each["judged"] and each["valid"]]
     if done.returncode or len(expected) < GRASPS:

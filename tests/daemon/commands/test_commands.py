@@ -7,7 +7,6 @@ import os
 import re
 import signal
 import socket
-import subprocess
 import sys
 from pathlib import Path
 
@@ -16,6 +15,7 @@ import pytest
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
 from tests.daemon.processes import TIMEOUT_S, start
 from tests.kit.inside import graspd
+from tests.kit.programs import ran
 from tests.kit.scenes import written
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
@@ -85,14 +85,10 @@ def test_the_example_controller_reports_outcomes_that_are_learned_and_recorded(
     code = (DEPLOY / "clients/python/try_outcomes.py").read_text()
     assert "/tmp/graspd-loop.ipc" in code
     with start("run", scene) as process:
-        controller = subprocess.run(
-            [sys.executable, "-c", code.replace("/tmp/graspd-", f"{tmp_path}/")],
+        controller = ran(
+            *(sys.executable, "-c", code.replace("/tmp/graspd-", f"{tmp_path}/")),
             env={**os.environ, "PYTHONPATH": str(DEPLOY / "clients/python")},
-            input="slipped\nwhat\nh\n",  # and then the input ends
-            capture_output=True,
-            text=True,
-            timeout=TIMEOUT_S,
-            check=False,
+            typed="slipped\nwhat\nh\n",  # and then the input ends
         )
         process.send_signal(signal.SIGTERM)
         process.communicate(timeout=TIMEOUT_S)

@@ -16,8 +16,9 @@ from graspd.daemon.publish.messages import Tactile, Verdict
 from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from graspd.drivers.recordings.csv_rows import read_rows
 from tests.bench.live import Subscriber
-from tests.daemon.processes import TIMEOUT_S, graspd, start, wait_for
+from tests.daemon.processes import GRASPD, TIMEOUT_S, start, wait_for
 from tests.kit.messages import decode_tactile
+from tests.kit.programs import ran
 from tests.kit.scenes import written
 from tests.ports import can_id, free_port, multicast_group
 
@@ -121,8 +122,8 @@ def test_a_bridge_that_goes_away_gives_unknown_and_comes_back(tmp_path: Path) ->
 def test_the_doctor_finds_the_faults_that_a_twin_simulates(tmp_path: Path) -> None:
     scene = scene_for("spi", tmp_path)
     with twin("spi", tmp_path, "--dead", "th_24", "--unplugged", "mf") as hardware:
-        people = graspd("doctor", scene, "--listen", 2)
-        program = graspd("doctor", scene, "--listen", 2, "--json")
+        people = ran(*GRASPD, "doctor", scene, "--listen", 2)
+        program = ran(*GRASPD, "doctor", scene, "--listen", 2, "--json")
         end(hardware)
     assert people.returncode == program.returncode == 1
     report = json.loads(program.stdout)
@@ -136,6 +137,6 @@ def test_the_doctor_finds_the_faults_that_a_twin_simulates(tmp_path: Path) -> No
 
 
 def test_the_doctor_without_a_scene_looks_at_the_computer() -> None:
-    result = graspd("doctor", "--listen", 0.3, "--json")
+    result = ran(*GRASPD, "doctor", "--listen", 0.3, "--json")
     assert result.returncode in (0, 1)
     assert json.loads(result.stdout)["findings"]

@@ -17,6 +17,7 @@ from graspd.daemon.process.text import printable
 from graspd.drivers.recordings.csv_player import DEMO_TABLE, SHOW_RECORDING
 from tests.daemon.processes import GRASPD, TIMEOUT_S, start, wait_for
 from tests.kit.crowd import SELECT_MAX, crowded
+from tests.kit.programs import ran
 from tests.kit.scenes import demo_scene, written
 
 ROOT = Path(__file__).parents[3]
@@ -26,14 +27,7 @@ DEMO_SCENE = ROOT / "deploy" / "scenes" / "demo.toml"
 def python(code: str, *arguments: object) -> subprocess.CompletedProcess[str]:
     """Run `code`, then graspd with `arguments`, in one process."""
     code += "\nimport sys\nfrom graspd.daemon.__main__ import main\nsys.exit(main())\n"
-    return subprocess.run(
-        [sys.executable, "-c", code, *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=TIMEOUT_S,
-        check=False,
-        cwd=ROOT,
-    )
+    return ran(sys.executable, "-c", code, *arguments, cwd=ROOT)
 
 
 AT_IMPORT = """
@@ -100,12 +94,8 @@ def test_graspd_loads_no_plugins_of_pydantic(tmp_path: Path) -> None:
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: stranger\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text("[pydantic]\nstranger = stranger:PLUGIN\n")
     (tmp_path / "stranger.py").write_text(f"open({str(tmp_path / 'was here')!r}, 'w')")
-    subprocess.run(
-        [*GRASPD, "check", str(DEMO_SCENE)],
-        env=os.environ | {"PYTHONPATH": f"{ROOT}:{tmp_path}"},
-        capture_output=True,
-        check=True,
-    )
+    folders = {"PYTHONPATH": f"{ROOT}:{tmp_path}"}
+    ran(*GRASPD, "check", DEMO_SCENE, env=os.environ | folders, check=True)
     assert not (tmp_path / "was here").exists()
 
 

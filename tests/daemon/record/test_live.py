@@ -8,7 +8,6 @@ import os
 import select
 import socket
 import struct
-import subprocess
 import sys
 import textwrap
 from collections.abc import Callable
@@ -23,6 +22,7 @@ from graspd.daemon.record.topics import schemas
 from tests.conftest import ROOT
 from tests.daemon.processes import TIMEOUT_S, start
 from tests.daemon.watch.watch_fakes import Talker
+from tests.kit.programs import ran
 from tests.ports import free_port
 
 pytest.importorskip("foxglove", reason="needs the extra `foxglove`")
@@ -138,12 +138,5 @@ def test_the_foxglove_library_never_logs_through_python() -> None:
             viewer.close()
         print([name for name in logging.root.manager.loggerDict if "foxglove" in name])
     """
-    result = subprocess.run(
-        (sys.executable, "-c", textwrap.dedent(script)),
-        cwd=ROOT,
-        check=False,
-        capture_output=True,
-        text=True,
-        timeout=TIMEOUT_S,
-    )
+    result = ran(sys.executable, "-c", textwrap.dedent(script), cwd=ROOT)
     assert result.stdout == "[]\n", result.stderr

@@ -6,7 +6,6 @@ import ctypes
 import gc
 import logging
 import os
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,6 +19,7 @@ from graspd.daemon.run.realtime import RealtimeMode
 from graspd.daemon.run.rehearsal import rehearse
 from graspd.daemon.scene.scene import Realtime
 from tests.kit.messages import GOLDEN_STATUS
+from tests.kit.programs import ran
 from tests.threads import at_work
 
 WORLD = """
@@ -44,15 +44,9 @@ def as_before() -> Iterator[None]:
 
 def in_a_process(text: str, folder: Path) -> str:
     """Return the output of the Python code `text`, run in a process that may give up rights."""
-    return subprocess.run(
-        [sys.executable, "-c", WORLD + text],
-        cwd=Path(__file__).parents[3],
-        env={**os.environ, "HOME": str(folder)},
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=200,
-    ).stdout
+    home = {"HOME": str(folder)}
+    command = [sys.executable, "-c", WORLD + text]
+    return ran(*command, cwd=Path(__file__).parents[3], env=os.environ | home, check=True).stdout
 
 
 def fifo_may_be_had() -> bool:

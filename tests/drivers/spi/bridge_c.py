@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import random
 import struct
-import subprocess
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,6 +16,7 @@ from cobs import cobs
 from numpy.typing import NDArray
 
 from tests.conftest import ROOT
+from tests.kit.programs import ran
 
 BRIDGE = ROOT / "deploy" / "bridge"
 WARNINGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-Wconversion", "-g", "-O1")
@@ -43,19 +43,16 @@ def build_program(folder: Path, name: str, *sources: str) -> Path:
     Warnings are errors.
     """
     program = folder / name
-    files = [str(file) for source in sources for file in sorted(BRIDGE.glob(source))]
+    files = [file for source in sources for file in sorted(BRIDGE.glob(source))]
     includes = [f"-I{BRIDGE}/src", f"-I{BRIDGE}/host"]
-    command = ["cc", *WARNINGS, *SANITIZERS, POSIX, *includes, *files, "-o", str(program)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=200, check=False)
+    done = ran("cc", *WARNINGS, *SANITIZERS, POSIX, *includes, *files, "-o", program)
     assert done.returncode == 0, done.stderr
     return program
 
 
 def ask(probe: Path, requests: Sequence[str]) -> list[str]:
     """The answers of the C implementation, one per request."""
-    done = subprocess.run(
-        [probe], input="\n".join(requests) + "\n", capture_output=True, text=True, check=False
-    )
+    done = ran(probe, typed="\n".join(requests) + "\n")
     assert done.returncode == 0, done.stderr
     answers = done.stdout.splitlines()
     assert len(answers) == len(requests)

@@ -38,6 +38,7 @@ from tests.drivers.spi.bridge_c import (
     judged,
     pattern,
 )
+from tests.kit.programs import ran
 from tests.kit.waiting import wait_until
 
 pytestmark = pytest.mark.usefixtures("comes_first")
@@ -50,12 +51,7 @@ def bridge_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         pytest.skip("no C compiler (cc)")
     folder = tmp_path_factory.mktemp("bridge")
     (folder / "empty.c").write_text("int main(void) { return 0; }\n")
-    attempt = subprocess.run(
-        ["cc", *SANITIZERS, str(folder / "empty.c"), "-o", str(folder / "empty")],
-        capture_output=True,
-        check=False,
-    )
-    if attempt.returncode != 0:
+    if ran("cc", *SANITIZERS, folder / "empty.c", "-o", folder / "empty").returncode != 0:
         pytest.skip("the C compiler has no address and undefined behaviour sanitizers")
     return folder
 
@@ -69,12 +65,7 @@ def bridge_probe(bridge_folder: Path) -> Path:
 
 def test_the_firmware_passes_its_own_tests(bridge_folder: Path) -> None:
     sources = ("test/test_bridge.c", "host/sim_sensor.c", "src/*.c")
-    done = subprocess.run(
-        [build_program(bridge_folder, "test_bridge", *sources)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = ran(build_program(bridge_folder, "test_bridge", *sources))
     assert done.returncode == 0, done.stdout + done.stderr
     names = re.findall(r"TEST\((\w+)\),", (BRIDGE / "test" / "test_bridge.c").read_text())
     assert done.stdout.splitlines() == [f"ok {name}" for name in names]
