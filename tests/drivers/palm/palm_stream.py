@@ -16,6 +16,11 @@ from tests.drivers.one_sweep import sweeps_of, tactile
 FINGERS = ("ff", "mf", "th")
 MS = 1_000_000
 ROUND = 14
+SNAPSHOT = [
+    *(1303, 1574, 3205, 1780, 1382, 1523, 3164, 1938, 904, 1332, 2977, 1706, 1730, 1434, 3060),
+    *(1853, 1955, 1814, 2132, 2294, 2496, 4029, 1668, 2931, 1768, 1377, *range(26, 37)),
+]
+"""One record of a real hand's `sensors`, from Shadow's documentation."""
 
 
 @dataclass

@@ -23,26 +23,21 @@ from graspd.drivers.palm.calibration import (
     load_calibration,
     parse_calibration,
 )
+from tests.drivers.palm.palm_stream import SNAPSHOT
 
 EXAMPLE = Path(__file__).parents[3] / "deploy" / "calibration" / "example_hand.toml"
 FFJ1 = [[3109, 0.0], [2673, 22.5], [1942, 45.0], [1247, 67.5], [649, 90.0]]
-# One record of a real hand's `sensors`, from Shadow's documentation.
-SNAPSHOT = [
-    *(1303, 1574, 3205, 1780, 1382, 1523, 3164, 1938, 904, 1332, 2977, 1706, 1730, 1434, 3060),
-    *(1853, 1955, 1814, 2132, 2294, 2496, 4029, 1668, 2931, 1768, 1377, *range(26, 37)),
-]
 FILE = Path("hand.toml")
 
 
 def degrees(calibration: JointCalibration, **raws: int | tuple[int, ...]) -> dict[str, float]:
     """Return the angles of all joints, degrees. `raws`: sensor values of some, by joint; THJ5 and
     WRJ1 have two each. The other sensors read 1."""
-    words = {"FFJ1": 0, "FFJ2": 1, "FFJ3": 2, "FFJ4": 3, "LFJ5": 16, "THJ1": 17, "THJ2": 18,
-             "THJ4": 20, "THJ5": 21, "WRJ1": 23, "WRJ2": 25}  # fmt: skip
     sensors = [1] * 37
     for joint, raw in raws.items():
         values = raw if isinstance(raw, tuple) else (raw,)
-        sensors[words[joint] : words[joint] + len(values)] = values
+        for word, value in zip(HALL_SENSORS[joint], values, strict=True):
+            sensors[word] = value
     return dict(zip(JOINTS, np.degrees(calibration.angles_rad(sensors)), strict=True))
 
 

@@ -17,6 +17,7 @@ from graspd.drivers.palm.packet import (
     parse_packet,
     position_of,
 )
+from tests.drivers.palm.palm_stream import SNAPSHOT
 
 # The layouts as C structures, written down from Shadow's protocol headers.
 
@@ -89,10 +90,6 @@ STRUCTURES = {
     ),
     Palm.PALM_0250: structure([*tactile(78), *MOTORS]),
 }
-SNAPSHOT = [
-    *(1303, 1574, 3205, 1780, 1382, 1523, 3164, 1938, 904, 1332, 2977, 1706, 1730, 1434, 3060),
-    *(1853, 1955, 1814, 2132, 2294, 2496, 4029, 1668, 2931, 1768, 1377, *range(26, 37)),
-]
 palms = pytest.mark.parametrize("palm", list(Palm))
 
 
