@@ -1,4 +1,4 @@
-"""The learner against an independent one, against batch fits, and against what could break it."""
+"""The learner against batch fits, and against what could break it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from msgspec.structs import replace
 from numpy.typing import ArrayLike, NDArray
 
 from graspd.models.trust.learner import Learner, LearnerState, sigmoid
-from tests.models.trust.reference import Reference
 from tests.models.trust.streams import CLIP, learn, lifts
 
 ONE_FINGER, THREE_FINGERS = 26, 78
@@ -23,22 +22,6 @@ def test_margins_beyond_thirty_are_clipped_to_thirty() -> None:
         for sign in (1.0, -1.0):
             _, found = learner.judge(sign * margin, x)
             np.testing.assert_array_equal(found, [sign * 15.0, 1.0, 0.0, 0.0])
-
-
-@pytest.mark.parametrize("inputs", [0, 1, 6])
-def test_the_learner_equals_a_dense_filter_in_long_double(inputs: int) -> None:
-    stream = [(margin, x[:inputs], y) for margin, x, y in lifts(40, inputs or 1)]
-    learner = Learner(inputs)
-    reference = Reference([m for m, *_ in stream], np.array([x for _, x, _ in stream]))
-    for grasp, (margin, x, slipped) in enumerate(stream):
-        found, features = learner.judge(margin, x)
-        assert found == pytest.approx(reference.log_odds(grasp), abs=1e-9)
-        learner.learn(features, slipped=slipped)
-        reference.learn(grasp, slipped)
-    mean, spread = reference.state(list(range(40)) if inputs else [])
-    found_mean, covariance = learner.at_told()
-    np.testing.assert_allclose(covariance, spread.astype(float), rtol=0.0, atol=1e-9)
-    np.testing.assert_allclose(found_mean, mean.astype(float), rtol=0.0, atol=1e-9)
 
 
 def coin(random: np.random.Generator) -> bool:

@@ -30,14 +30,21 @@ def test_the_prior_is_scikit_learns_kernel() -> None:
     np.testing.assert_allclose([Residual(told).shared(x) for x in told[:5]], apart, rtol=1e-12)
 
 
-@pytest.mark.parametrize(("kept", "spread"), [(128, 0.5), (7, 0.5), (7, 1e-6), (7, 100.0)])
+@pytest.mark.parametrize(
+    ("inputs", "kept", "spread"),
+    [
+        *((inputs, 128, 0.5) for inputs in (0, 1, 6, INPUTS)),
+        *((INPUTS, 7, spread) for spread in (0.5, 1e-6, 100.0)),
+    ],
+)
 def test_the_learner_equals_a_dense_computation_over_all_grasps(
-    kept: int, spread: float, monkeypatch: pytest.MonkeyPatch
+    inputs: int, kept: int, spread: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Grasps nearly equal make a kernel that is nearly singular."""
     monkeypatch.setattr(learner_module, "GRASPS_MAX", kept)
-    stream = list(lifts(60, INPUTS, spread=spread))
-    learner = Learner(INPUTS)
+    drawn = lifts(60, inputs or 1, spread=spread)
+    stream = [(margin, x[:inputs], slipped) for margin, x, slipped in drawn]
+    learner = Learner(inputs)
     reference = Reference([m for m, *_ in stream], np.array([x for _, x, _ in stream]))
     for grasp, (margin, x, slipped) in enumerate(stream[:40]):
         learner.learn(learner.judge(margin, x)[1], slipped=slipped)
@@ -47,6 +54,10 @@ def test_the_learner_equals_a_dense_computation_over_all_grasps(
         for other in range(grasp + 1, len(stream), 5):
             found = learner.judge(*stream[other][:2])[0]
             assert found == pytest.approx(reference.log_odds(other), abs=1e-9)
+    if kept > 40:
+        expected = reference.state(list(range(40)) if inputs else [])
+        for array, dense in zip(learner.at_told(), expected, strict=True):
+            np.testing.assert_allclose(array, dense.astype(float), rtol=0.0, atol=1e-9)
 
 
 def test_rounding_of_many_outcomes_does_not_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
