@@ -98,7 +98,7 @@ def cpp_client(code: str, folder: Path) -> list[str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("language", "made"), [("python", python_client), ("cpp", cpp_client)])
-def test_the_program_of_the_clients_page_lifts(
+def test_the_clients_pages_program_lifts_only_with_a_daemon(
     language: str, made: Callable[[str, Path], list[str]], tmp_path: Path
 ) -> None:
     with Daemon(tmp_path, whole_grasps=True) as daemon:
@@ -114,3 +114,4 @@ def test_the_program_of_the_clients_page_lifts(
             return "lifted" in said
 
         wait_until(lifts)
+    assert not lifts()

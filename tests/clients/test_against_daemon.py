@@ -18,7 +18,6 @@ from graspd.daemon.publish.keys import make
 from graspd.daemon.publish.messages import decode_outcome
 from tests.clients.bench import Daemon, free_endpoint
 from tests.clients.building import sleep_at_will
-from tests.clients.either import Connect
 from tests.clients.messages import frames, verdict
 from tests.kit.programs import ran
 from tests.kit.waiting import wait_until
@@ -49,13 +48,6 @@ def line_with(process: subprocess.Popen[str], *wanted: str) -> list[str]:
 
 def boot_id(words: list[str]) -> str:
     return words[words.index("boot") + 1]
-
-
-@pytest.mark.parametrize("ask", ["ask", None])
-def test_a_stable_grasp_may_be_lifted(connect: Connect, tmp_path: Path, ask: str | None) -> None:
-    with Daemon(tmp_path, whole_grasps=True):
-        graspd = connect(tmp_path, ask)
-        wait_until(lambda: graspd.lift(1.0).may)
 
 
 def test_over_tcp_without_a_shared_clock_a_lift_is_allowed(tmp_path: Path) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
@@ -72,28 +71,6 @@ def test_pkg_config_finds_the_installed_client(prefix: Path, project: Path) -> N
     line = block("sh", "cmake -S")[1]
     run("sh", "-c", f"cd {project} && {line}", PKG_CONFIG_PATH=str(described.parent))
     works(project / PROGRAM, project)
-
-
-def test_the_readmes_program_lifts_nothing_without_an_answer(prefix: Path, project: Path) -> None:
-    """The README's programs in C++ and in Python, without a daemon."""
-    said = {}
-    endpoint = f"ipc://{project}/nobody"
-    begins = {"python": "from graspd_client import Client, Outcome", "cpp": "#include <iostream>"}
-    programs = {each: "\n".join(block(each, first)) for each, first in begins.items()}
-    assert all(code.count("ipc:///run/graspd/right") == 2 for code in programs.values())
-    cpp, python = (
-        programs[each].replace("ipc:///run/graspd/right", endpoint) for each in ("cpp", "python")
-    )
-    (project / "program.cpp").write_text(f"{cpp}\nbool lift() {{ return true; }}\n")
-    words = ["g++", "-std=c++17", "-Wall", "-Wextra", "-Werror", f"-I{prefix}/include"]
-    run(*words, project / "program.cpp", "-lzmq", "-o", project / "program")
-    said["cpp"] = run(project / "program")
-    path = str(CPP.parent / "python")
-    said["python"] = run(sys.executable, "-c", python, PYTHONPATH=path)
-    assert said == {
-        "cpp": "do not lift: unknown\n",
-        "python": "do not lift: unknown ('no-message',)\n",
-    }
 
 
 def test_a_project_for_another_minor_version_refuses_this_package(
