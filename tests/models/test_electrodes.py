@@ -162,14 +162,11 @@ def _moved_by(
     return float(abs(along @ (values.ravel() - mean)) / np.sqrt(along @ chosen))
 
 
-def diagonal(size: int, value: float) -> tuple[tuple[float, ...], ...]:
-    return tuple((0.0,) * row + (value,) for row in range(size))
-
-
 def round_numbers(spread: float = 1e-6, distance_max: float = 2.5) -> SeenCounts:
     row = ((2000,) * 24,) * 3
     centre = ((2000.0,) * 24,) * 3
-    return SeenCounts(row, row, 250, centre, diagonal(72, spread), distance_max)
+    diagonal = tuple((0.0,) * place + (spread,) for place in range(72))
+    return SeenCounts(row, row, 250, centre, diagonal, distance_max)
 
 
 def session(**changes: object) -> dict[str, object]:

@@ -38,13 +38,6 @@ def socket_bus(monkeypatch: pytest.MonkeyPatch) -> Iterator[SocketBus]:
         yield bus
 
 
-@pytest.fixture
-def stamped_bus(monkeypatch: pytest.MonkeyPatch) -> Iterator[SocketBus]:
-    with SocketBus(stamped=True) as bus:
-        stand_in(monkeypatch, lambda: bus)
-        yield bus
-
-
 def over_socket(**options: Any) -> CanBridgeDriver:  # noqa: ANN401
     options.setdefault("arbitration_id", SAMPLE_ID)
     return CanBridgeDriver("socketcan", LOOPBACK, sequence="electrodes", **options)
@@ -65,14 +58,16 @@ def test_a_socketcan_bus_is_read_from_its_socket(socket_bus: SocketBus) -> None:
     ("step_ns", "age_ns"), [(3_600_000 * MS, 3_600_000 * MS), (-5_000 * MS, 0)]
 )
 def test_a_wall_clock_step_makes_frames_old_but_never_future(
-    stamped_bus: SocketBus, step_ns: int, age_ns: int
+    step_ns: int, age_ns: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with over_socket(wall_clock=lambda: time.time_ns() + step_ns) as driver:
-        before_ns = time.monotonic_ns()
-        stamped_bus.send(*sweep_of_frames(0))
-        asked_ns = time.monotonic_ns()
-        readings = tactile(driver.read_ready())
-        read_ns = time.monotonic_ns()
+    with SocketBus(stamped=True) as bus:
+        stand_in(monkeypatch, lambda: bus)
+        with over_socket(wall_clock=lambda: time.time_ns() + step_ns) as driver:
+            before_ns = time.monotonic_ns()
+            bus.send(*sweep_of_frames(0))
+            asked_ns = time.monotonic_ns()
+            readings = tactile(driver.read_ready())
+            read_ns = time.monotonic_ns()
     between_ns = read_ns - asked_ns + MS
     assert before_ns - between_ns <= readings[-1].t_ns + age_ns <= read_ns
 

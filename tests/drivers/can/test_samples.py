@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graspd.drivers.base import ElectrodeFault, TactileReading
+from graspd.drivers.base import ElectrodeFault
 from graspd.drivers.biotac import PAC, SEQUENCES
 from graspd.drivers.can.samples import Fate, Held, classify
 from graspd.drivers.can.sweep_clock import SweepClock, Timing
@@ -31,13 +31,6 @@ MS = 1_000_000
 PERIOD_NS = 24 * SLOT_NS
 
 
-def missing_electrodes(reading: TactileReading) -> list[int]:
-    """Electrodes, from 1, that are missing, the same for all fingers."""
-    flagged = reading.faults == ElectrodeFault.MISSING
-    assert (flagged == flagged[0]).all()
-    return [int(electrode) + 1 for electrode in np.flatnonzero(flagged[0])]
-
-
 @pytest.mark.parametrize("distance", [1, 2, 3])
 @pytest.mark.parametrize("at", [0, 20, 23])
 def test_a_late_sample_is_placed_unless_its_sweep_has_ended(at: int, distance: int) -> None:
@@ -51,7 +44,9 @@ def test_a_late_sample_is_placed_unless_its_sweep_has_ended(at: int, distance: i
     for sweep, reading in enumerate(readings):
         assert number_in(reading) == sweep
     in_time = at + distance < 23
-    assert missing_electrodes(readings[6]) == ([] if in_time else [at + 1])
+    missing = readings[6].faults == ElectrodeFault.MISSING
+    assert (missing == missing[0]).all()
+    assert np.flatnonzero(missing[0]).tolist() == ([] if in_time else [at])
     assert counters.reordered_frames == in_time
     assert counters.late_frames == (not in_time)
     assert all(not reading.faults.any() for n, reading in enumerate(readings) if n != 6)
@@ -106,15 +101,6 @@ def test_only_gaps_up_to_two_seconds_teach_a_period() -> None:
     assert periods([2_000 * MS] * 5)[-1] == 2_000 * MS
 
 
-def missed_when_late(number: int, late_ns: int) -> int:
-    """Number of sweeps counted as missed if all samples from sweep `number` on are late."""
-    made, counters = assembler()
-    for sweep in range(number + 2):
-        for channel, words, t_ns in samples(sweep):
-            made.push(channel, words, t_ns + (late_ns if sweep >= number else 0))
-    return counters.missed_readings
-
-
 @pytest.mark.parametrize(
     ("number", "late_ns", "missed"),
     [
@@ -129,7 +115,12 @@ def missed_when_late(number: int, late_ns: int) -> int:
 def test_sweeps_missed_before_a_late_one_are_counted(
     number: int, late_ns: int, missed: int
 ) -> None:
-    assert missed_when_late(number, late_ns) == missed
+    """All samples from sweep `number` on are late."""
+    made, counters = assembler()
+    for sweep in range(number + 2):
+        for channel, words, t_ns in samples(sweep):
+            made.push(channel, words, t_ns + (late_ns if sweep >= number else 0))
+    assert counters.missed_readings == missed
 
 
 @pytest.mark.parametrize(
