@@ -93,7 +93,9 @@ def unplugged(lab: Lab) -> Outcome:
     time.sleep(OUTAGE_S)
     in_s = lab.now_s()
     lab.machine.plug()
-    reading = lab.await_message("serial", in_s, "a reading", _fresh)
+    reading = lab.await_message(
+        "serial", in_s, "a reading", lambda m: m.kind == "verdict" and not _stale(m)
+    )
     lab.await_message("serial", in_s, "a judged grasp")
     _same_process(lab, "serial", pid)
     unknown_s = said.t_s - out_s
@@ -106,10 +108,6 @@ def _unknown(message: Message) -> bool:
 
 def _stale(message: Message) -> bool:
     return _unknown(message) and "stale" in message.body["reasons"]
-
-
-def _fresh(message: Message) -> bool:
-    return message.kind == "verdict" and "stale" not in message.body["reasons"]
 
 
 def _same_process(lab: Lab, hand: str, pid: str) -> None:
