@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -272,29 +272,21 @@ START_S = 70.0
 ACTIONS = ("send", "lose", "copy", "late", "stall", "stale")
 """What happens to a sweep's message. `copy`: it comes again later; `late`: others overtake it;
 `stall`: those behind it wait as well; `stale`: it repeats the time of the one before."""
-Plan = list[tuple[str, int]]
-"""For each sweep an action, and for how many periods its message, or the copy, is held back."""
 
 
 @st.composite
-def links(draw: st.DrawFn) -> Plan:
-    """Draw a plan; the first sweep comes at once."""
-    action = st.tuples(st.sampled_from(ACTIONS), st.integers(1, 20))
-    runs = draw(st.lists(st.tuples(action, st.integers(1, 12)), min_size=1, max_size=15))
-    return [("send", 0), *(each for each, times in runs for _ in range(times))]
+def arrivals(draw: st.DrawFn) -> list[tuple[int, Datagram, int]]:
+    """Draw times of arrival in ns, datagrams and numbers of their sweeps, made every 10 ms.
 
-
-def arrivals(
-    plan: Plan, counts: Callable[[int], list[list[int]]]
-) -> list[tuple[int, Datagram, int]]:
-    """Return time of arrival in ns, datagram and number of its sweep; a sweep is made every 10 ms.
-
-    `counts`: function that returns the counts of a sweep by its number.
+    The first sweep comes at once. `periods`: time for which a message, or its copy, is held back.
     """
+    actions = st.tuples(st.sampled_from(ACTIONS), st.integers(1, 20))
+    runs = draw(st.lists(st.tuples(actions, st.integers(1, 12)), min_size=1, max_size=15))
+    plan = [("send", 0), *(each for each, times in runs for _ in range(times))]
     found: list[tuple[int, Datagram, int]] = []
     held_until = 0
     for place, (action, periods) in enumerate(plan):
-        good = dict(zip(FINGERS, counts(place), strict=True))
+        good = dict(zip(FINGERS, counts_of(place).tolist(), strict=True))
         now, time_s = max(place, held_until), START_S + place / 100
         if action == "stall":
             now = held_until = max(held_until, place + periods)
@@ -312,8 +304,8 @@ def arrivals(
 
 
 @settings(max_examples=100, deadline=None)
-@given(links())
-def test_no_count_is_older_than_its_reading_says(plan: Plan) -> None:
+@given(arrivals())
+def test_no_count_is_older_than_its_reading_says(sent: list[tuple[int, Datagram, int]]) -> None:
     receiver, clock = Receiver(), Clock()
     start_ns = clock.now_ns
     with pytest.MonkeyPatch.context() as patch:
@@ -321,7 +313,7 @@ def test_no_count_is_older_than_its_reading_says(plan: Plan) -> None:
         driver = TactileStreamDriver(LOOPBACK, FINGERS, "right", clock=clock)
         driver.open()
         last = -1
-        for received_ns, datagram, place in arrivals(plan, lambda at: counts_of(at).tolist()):
+        for received_ns, datagram, place in sent:
             clock.now_ns = start_ns + received_ns
             receiver.waiting.append(datagram)
             readings: list[Reading] = [*driver.read_ready(), *driver.read_ready()]
