@@ -13,7 +13,6 @@ import pytest
 from numpy.typing import NDArray
 
 from graspd.models import known_grasps, zoo
-from graspd.models.contract import ModelError
 from graspd.models.runtime import TactileModel
 from graspd.models.training.data.datasets import read_all
 
@@ -117,10 +116,3 @@ def test_no_committed_file_names_the_machine_that_made_it() -> None:
         text = path.read_bytes().decode("latin-1")
         assert "site-packages" not in text
         assert not re.search(r"/(tmp|home|usr|work|root)/", text)
-
-
-def test_an_unknown_model_name_lists_the_zoos_models() -> None:
-    assert "cnn1" in zoo.names()
-    assert zoo.find("cnn1") == zoo.ZOO / "cnn1.onnx"
-    with pytest.raises(ModelError, match=r"no model 'cnn9' in the zoo; there are: .*cnn1"):
-        zoo.find("cnn9")

@@ -38,7 +38,7 @@ from tests.drivers.can.can_standin import (
     sweep_messages,
     sweep_of_frames,
 )
-from tests.drivers.can.can_words import samples, word
+from tests.drivers.can.can_words import samples
 from tests.drivers.one_sweep import counts_of, tactile
 from tests.kit.clock import Clock
 
@@ -51,13 +51,6 @@ def dbc() -> Database:
     loaded = cantools.database.load_file(ROOT / "deploy" / "can" / "graspd.dbc")
     assert isinstance(loaded, Database)
     return loaded
-
-
-def test_a_sample_of_three_sensors_is_encoded_and_accepted() -> None:
-    assert encode_sample(17, word(2602) + word(2713) + word(2391)) == E1_SAMPLE
-    made, counters = decoder()
-    made.push(CanFrame(0x100, E1_SAMPLE), 0)
-    assert counters.accepted_frames == 1
 
 
 def test_the_dbc_file_knows_every_channel_of_the_manual(dbc: Database) -> None:
