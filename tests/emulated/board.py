@@ -79,9 +79,6 @@ class Board:
         return self
 
     def __exit__(self, *_details: object) -> None:
-        self.end()
-
-    def end(self) -> None:
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.close()
