@@ -28,6 +28,7 @@ from tests.drivers.recordings.bags import ABSENT, WITH_ARRAY, BagOf, Sweep
 START_NS = 1_542_585_600_000_000_000
 PERIOD_NS = 10_000_000
 JOINTS = ("FFJ3", "MFJ3", "THJ5", "FFJ2", "MFJ2", "THJ2")
+FINGERS = ("ff", "mf", "th")
 ROWS = 300
 """Rows of the demo that hold one grasp."""
 
@@ -42,10 +43,7 @@ def sweeps_of(stream: pd.DataFrame, **joints: str) -> list[Sweep]:
     return [
         Sweep(
             START_NS + round(row["t"] * 1e9),
-            {
-                finger: row[electrode_columns(finger)].to_numpy(dtype=np.int16)
-                for finger in ("ff", "mf", "th")
-            },
+            {finger: row[electrode_columns(finger)].to_numpy(dtype=np.int16) for finger in FINGERS},
             {prefix + name: float(row[name]) for name in JOINTS},
         )
         for _, row in stream.drop(columns=["object", "slipped"]).iterrows()
@@ -56,17 +54,23 @@ def noise(number: int, seed: int = 1) -> list[Sweep]:
     """Sweeps that never repeat."""
     counts = np.random.default_rng(seed).integers(1000, 3000, (number, 3, 24), dtype=np.int16)
     return [
-        Sweep(START_NS + index * PERIOD_NS, dict(zip(("ff", "mf", "th"), sweep, strict=True)))
+        Sweep(START_NS + index * PERIOD_NS, dict(zip(FINGERS, sweep, strict=True)))
         for index, sweep in enumerate(counts)
     ]
 
 
-def readings_of(path: Path, fingers: tuple[str, ...] = ("ff", "mf", "th")) -> list[TactileReading]:
+def played(
+    *paths: Path, fingers: Sequence[str] = FINGERS
+) -> tuple[BagDriver, list[TactileReading]]:
     found: list[TactileReading] = []
-    with BagDriver([path], fingers) as driver:
+    with BagDriver(paths, fingers) as driver:
         while not driver.exhausted:
             found += [each for each in driver.read_ready() if isinstance(each, TactileReading)]
-    return found
+    return driver, found
+
+
+def readings_of(path: Path, fingers: Sequence[str] = FINGERS) -> list[TactileReading]:
+    return played(path, fingers=fingers)[1]
 
 
 @pytest.fixture(scope="module")
@@ -117,11 +121,8 @@ def test_a_sensor_that_starts_late_is_read(tmp_path: Path) -> None:
     sweeps = noise(30)
     sweeps[0].electrodes["th"] = ABSENT
     path = BagOf(1).write(tmp_path / "hand.bag", sweeps)
-    assert fingers_of(path) == ("ff", "mf", "th")
-    with BagDriver([path], ("ff", "mf", "th")) as driver:
-        while not driver.exhausted:
-            driver.read_ready()
-        assert driver.period_ns == PERIOD_NS
+    assert fingers_of(path) == FINGERS
+    assert played(path)[0].period_ns == PERIOD_NS
 
 
 @pytest.mark.parametrize(
@@ -162,11 +163,8 @@ def test_a_repeated_message_is_dropped_and_counted(
     tmp_path: Path, change: Callable[[list[Sweep]], list[Sweep]], left: int, repeats: int
 ) -> None:
     path = BagOf(1).write(tmp_path / "hand.bag", change(noise(70)))
-    with BagDriver([path], ("ff", "mf", "th")) as driver:
-        while not driver.exhausted:
-            driver.read_ready()
-    assert driver.counters.readings == left
-    assert driver.counters.repeats == repeats
+    counters = played(path)[0].counters
+    assert (counters.readings, counters.repeats) == (left, repeats)
 
 
 @pytest.mark.parametrize(("back_ns", "left"), [(900_000_000, 20), (1_000_000_000, 40)])
@@ -175,10 +173,8 @@ def test_messages_after_a_clock_set_back_a_second_are_kept(
 ) -> None:
     first, sweeps = BagOf(1).write(tmp_path / "1.bag", noise(20)), noise(20, seed=2)
     later = [each._replace(t_ns=each.t_ns + 19 * PERIOD_NS - back_ns) for each in sweeps]
-    with BagDriver([first, BagOf(1).write(tmp_path / "2.bag", later)], ("ff",)) as driver:
-        while not driver.exhausted:
-            driver.read_ready()
-    assert driver.counters.readings == left
+    _, readings = played(first, BagOf(1).write(tmp_path / "2.bag", later), fingers=("ff",))
+    assert len(readings) == left
 
 
 def test_a_bag_whose_stamps_stand_still_logs_a_warning(
@@ -314,11 +310,8 @@ def test_a_message_with_too_few_electrodes_is_dropped_and_counted(tmp_path: Path
     sweeps = noise(3)
     sweeps[1].electrodes["ff"] = ABSENT[:20]
     path = BagOf(1).write(tmp_path / "hand.bag", sweeps)
-    with BagDriver([path], ("ff", "mf", "th")) as driver:
-        readings = 0
-        while not driver.exhausted:
-            readings += len(driver.read_ready())
-    assert (readings, driver.counters.malformed) == (2, 1)
+    driver, readings = played(path)
+    assert (len(readings), driver.counters.malformed) == (2, 1)
 
 
 def test_joints_are_read_from_joint_states_among_several_topics(tmp_path: Path) -> None:
@@ -339,7 +332,7 @@ def test_bags_of_different_hands_are_refused_as_one_run(tmp_path: Path) -> None:
         BagOf(1).write(tmp_path / f"{hand}.bag", noise(5), topic=f"/{hand}/tactile")
         for hand in ("rh", "lh")
     ]
-    with BagDriver(bags, ("ff", "mf", "th")) as driver:
+    with BagDriver(bags, FINGERS) as driver:
         readings = [driver.read_ready() for _ in range(5)]
         assert all(readings)
         with pytest.raises(RecordingError, match=r"lh\.bag: has /lh/tactile, .* /rh/tactile"):
