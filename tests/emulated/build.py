@@ -15,6 +15,7 @@ from typing import Final
 import pytest
 
 from tests.conftest import ROOT, data_dir
+from tests.kit.programs import ran
 
 BRIDGE: Final = ROOT / "deploy" / "bridge"
 FOLDER: Final = ROOT / "build" / "pico"
@@ -25,17 +26,16 @@ NEEDED: Final = {
     COMPILER: "gcc-arm-none-eabi",
     "cmake": "cmake",
     "ninja": "ninja-build",
+    "node": "nodejs",
+    "npm": "npm",
+    "cc": "gcc",
 }
-"""Programs that a build calls, and the Debian packages that have them."""
+"""Programs of a build and of the emulator, and the Debian packages that have them."""
 EMULATOR: Final = ROOT / "tests" / "emulated" / "emulator"
 HOST: Final = BRIDGE / "host"
 _ADDON: Final = (EMULATOR / "sensors.c", HOST / "sim_sensor.c", HOST / "counts.c")
 _PARTS: Final = (EMULATOR / "package-lock.json", *_ADDON, HOST / "sim_sensor.h", HOST / "counts.h")
 SUBSET: Final = "pico-sdk-*-subset.tar.xz"
-
-
-class MissingError(Exception):
-    """A build lacks a program or file; the message says which."""
 
 
 def shared_dir() -> Path | None:
@@ -50,10 +50,8 @@ def shared_dir() -> Path | None:
 def image(sensors: int = 3, clock_mhz: int = 125, sequence: str = "electrodes") -> Path:
     """Build the firmware and return its `.bin`, the content of the flash from 0x10000000.
 
-    `clock_mhz` is the chip's system clock (125, 133, 200). Raises `MissingError` where a tool or
-    the pico-sdk is missing.
+    `clock_mhz` is the chip's system clock (125, 133, 200).
     """
-    check_tools()
     FOLDER.mkdir(parents=True, exist_ok=True)
     folder = FOLDER / f"{sensors}-{clock_mhz}-{sequence}"
     with _alone(FOLDER / "lock"):
@@ -68,30 +66,13 @@ def image(sensors: int = 3, clock_mhz: int = 125, sequence: str = "electrodes") 
     return folder / "bridge.bin"
 
 
-def check_tools() -> None:
-    """Raise `MissingError` if the compiler, its C library, CMake or Ninja is missing."""
-    for program, package in NEEDED.items():
-        if shutil.which(program) is None:
-            raise MissingError(f"no {program}: install {package}")
-    asked = [COMPILER, "-print-file-name=nosys.specs"]
-    found = subprocess.run(asked, capture_output=True, text=True, check=True).stdout.strip()
-    if not Path(found).is_absolute():
-        raise MissingError("no C library for ARM: install libnewlib-arm-none-eabi")
-
-
 def pico_sdk() -> Path:
-    """Return the pico-sdk that `PICO_SDK_PATH` names, or the subset, unpacked.
-
-    Raises `MissingError` if there is none.
-    """
+    """Return the pico-sdk that `PICO_SDK_PATH` names, or the subset, unpacked."""
     named = os.environ.get("PICO_SDK_PATH")
     if named is not None:
-        if not (Path(named) / "pico_sdk_init.cmake").is_file():
-            raise MissingError(f"no pico-sdk at PICO_SDK_PATH {named!r}")
         return Path(named)
     shared = shared_dir()
-    if shared is None:
-        raise MissingError("no pico-sdk: set PICO_SDK_PATH")
+    assert shared is not None
     packed = max(shared.glob(SUBSET))
     sdk = FOLDER / packed.name.removesuffix(".tar.xz")
     if not sdk.is_dir():
@@ -121,23 +102,21 @@ def _run(*command: str | Path) -> None:
 
 def missing() -> str | None:
     """Return why nothing can be emulated here, in one line; None if it can."""
-    absent = [command for command in ("node", "npm", "cc") if shutil.which(command) is None]
+    absent = [package for program, package in NEEDED.items() if shutil.which(program) is None]
     if absent:
-        return f"no {', '.join(absent)} for the emulated chip"
-    try:
-        check_tools()
-    except MissingError as error:
-        return f"{error}, for the emulated chip"
+        return f"no emulated chip without it: apt install {' '.join(absent)}"
+    found = ran(COMPILER, "-print-file-name=nosys.specs", check=True).stdout.strip()
+    if not Path(found).is_absolute():
+        return "no emulated chip without it: apt install libnewlib-arm-none-eabi"
     if shared_dir() is None:
         return "no pico-sdk and boot ROM (shared/pico beside the project), for the emulated chip"
     return None
 
 
 def boot_rom() -> Path:
-    """Return the file of the RP2040's boot ROM. Raises `MissingError`."""
+    """Return the file of the RP2040's boot ROM."""
     shared = shared_dir()
-    if shared is None:
-        raise MissingError("no boot ROM of the RP2040")
+    assert shared is not None
     return shared / "bootrom_b1.bin"
 
 

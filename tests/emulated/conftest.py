@@ -29,10 +29,3 @@ def board(image: Image) -> Iterator[Board]:
     """An emulated board that is not switched on yet."""
     with Board() as one:
         yield one
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Give each test here 600 s of real time: only a test that hangs takes longer."""
-    for item in items:
-        if item.path.is_relative_to(Path(__file__).parent):
-            item.add_marker(pytest.mark.timeout(600))

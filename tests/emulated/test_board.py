@@ -10,6 +10,8 @@ from tests.drivers.spi.bridge_c import HELLO, STOP, SWEEP, counts_of, frame, pat
 from tests.emulated.board import BOOT_MS, Board, serials
 from tests.emulated.conftest import Image
 
+pytestmark = pytest.mark.timeout(600)
+
 STEP_MS = 25
 
 

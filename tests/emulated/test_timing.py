@@ -35,6 +35,8 @@ from tests.emulated.board import (
 )
 from tests.emulated.conftest import Image
 
+pytestmark = pytest.mark.timeout(600)
+
 PERIOD_MS = 10.0
 SWEEPS = 20
 COMMANDS = {
