@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from collections.abc import Iterator
 from dataclasses import dataclass
+from operator import itemgetter
 
 import numpy as np
 import pytest
@@ -131,18 +132,11 @@ class Way:
         return (host_ns - START_NS + round(ahead_ns)) * self.tick_hz // S
 
 
-@dataclass(frozen=True, slots=True)
-class Event:
-    """A sweep, or an answered PING if `sent_ns` is not None. Times are host ns; `made_ns`: of the
-    device's tick."""
+def events(way: Way, duration_s: int) -> Iterator[tuple[int, int, int | None]]:
+    """Sweeps at 100 Hz and PINGs, four a second, in order of arrival.
 
-    made_ns: int
-    arrival_ns: int
-    sent_ns: int | None = None
-
-
-def events(way: Way, duration_s: int) -> Iterator[Event]:
-    """Sweeps at 100 Hz and PINGs, four a second, in order of arrival."""
+    Yields host times, ns: of the device's tick, of arrival, and of the PING; None: it is a sweep.
+    """
     rng = random.Random(way.seed)
     batch_ns = round(way.batch_ms * MS)
 
@@ -155,18 +149,18 @@ def events(way: Way, duration_s: int) -> Iterator[Event]:
         ready_ns = made_ns + delay_ns()
         return -(-ready_ns // batch_ns) * batch_ns if batch_ns else ready_ns
 
-    made = []
+    made: list[tuple[int, int, int | None]] = []
     for k in range(duration_s * 100):
         made_ns = START_NS + S + k * S // 100
-        made.append(Event(made_ns, arrival_ns(made_ns)))
+        made.append((made_ns, arrival_ns(made_ns), None))
     for send_ms in range(0, 1000 * duration_s, 247):
         sent_ns = START_NS + S + send_ms * MS
         made_ns = sent_ns + delay_ns()
-        made.append(Event(made_ns, arrival_ns(made_ns), sent_ns))
+        made.append((made_ns, arrival_ns(made_ns), sent_ns))
     last_ns = 0
-    for event in sorted(made, key=lambda event: event.made_ns):  # a serial line keeps the order
-        last_ns = max(last_ns, event.arrival_ns)
-        yield Event(event.made_ns, last_ns, event.sent_ns)
+    for made_ns, at_ns, ping_ns in sorted(made, key=itemgetter(0)):  # a line keeps the order
+        last_ns = max(last_ns, at_ns)
+        yield made_ns, last_ns, ping_ns
 
 
 def too_old_ns(way: Way, duration_s: int) -> Iterator[tuple[int, int]]:
@@ -177,20 +171,19 @@ def too_old_ns(way: Way, duration_s: int) -> Iterator[tuple[int, int]]:
     """
     pings: list[tuple[int, int]] = []
     clock = None
-    for event in events(way, duration_s):
-        tick = way.tick(event.made_ns)
-        if event.sent_ns is not None:
-            pings = [*pings[-7:], (event.sent_ns, event.made_ns)]
+    for made_ns, arrival_ns, sent_ns in events(way, duration_s):
+        tick = way.tick(made_ns)
+        if sent_ns is not None:
+            pings = [*pings[-7:], (sent_ns, made_ns)]
             if clock is None:
-                clock = DeviceClock(way.tick_hz, tick, event.sent_ns, event.arrival_ns)
-            clock.round_trip(tick, event.sent_ns, event.arrival_ns)
-        elif clock is not None and event.made_ns > pings[0][1] + MS:
+                clock = DeviceClock(way.tick_hz, tick, sent_ns, arrival_ns)
+            clock.round_trip(tick, sent_ns, arrival_ns)
+        elif clock is not None and made_ns > pings[0][1] + MS:
             most_ns = min(
-                made_ns - sent_ns + round(abs(event.made_ns - made_ns) * 1.001e-3)
-                for sent_ns, made_ns in pings
+                heard_ns - ping_ns + round(abs(made_ns - heard_ns) * 1.001e-3)
+                for ping_ns, heard_ns in pings
             )
-            too_old = event.made_ns - clock.host_ns(tick, event.arrival_ns)
-            yield too_old, most_ns + 2 * S // way.tick_hz + 2
+            yield made_ns - clock.host_ns(tick, arrival_ns), most_ns + 2 * S // way.tick_hz + 2
 
 
 ways = st.builds(
@@ -308,11 +301,10 @@ def test_no_reading_is_older_than_ten_seconds() -> None:
 def test_a_clock_that_jumps_raises_at_once(way: Way, jump_ns: int, back: bool) -> None:
     """Ahead: a computer slept, its clock stood meanwhile. `back`: a counter wraps or is reset."""
     clock = DeviceClock(way.tick_hz, way.tick(START_NS), START_NS, START_NS + S)
-    sweeps = [event for event in events(way, 5) if event.sent_ns is None]
-    for event in sweeps[:200]:
-        clock.host_ns(way.tick(event.made_ns), event.arrival_ns)
-    tick = way.tick(sweeps[200].made_ns)
+    sweeps = [(made_ns, at_ns) for made_ns, at_ns, sent_ns in events(way, 5) if sent_ns is None]
+    for made_ns, arrival_ns in sweeps[:200]:
+        clock.host_ns(way.tick(made_ns), arrival_ns)
+    made_ns, arrival_ns = sweeps[200]
+    tick = way.tick(made_ns)
     with pytest.raises(ClockError):
-        clock.host_ns(
-            tick % 1000 if back else tick + jump_ns * way.tick_hz // S, sweeps[200].arrival_ns
-        )
+        clock.host_ns(tick % 1000 if back else tick + jump_ns * way.tick_hz // S, arrival_ns)
