@@ -1,8 +1,7 @@
 """How gate and finger states follow generated hands: the figures of deploy/JUDGING.md.
 
-`python -m tests.bench.gate [EPISODES]` prints a row for sweeps at 100 Hz that repeat values of
-71.43 Hz, as a palm's do, and one for fresh sweeps at 100 Hz. Each figure comes from EPISODES hands:
-they hold, or the object slides along their fingers.
+`python -m tests.bench.gate [EPISODES]` prints a row for fresh sweeps at 100 Hz. Each figure comes
+from EPISODES hands: they hold, or the object slides along their fingers.
 """
 
 from __future__ import annotations
@@ -36,7 +35,6 @@ REST_COUNTS, PRESSED_COUNTS = 2500.0, 600.0
 NONE, ONE, THREE = (False,) * 3, (True, False, False), (True,) * 3
 """True for each finger along which the object slides."""
 HEAD = (
-    "sweeps",
     "a hand holds: the verdict stands",
     "three fingers slide: it stands",
     "slides in which it ever does",
@@ -96,15 +94,13 @@ def feel(
     seed: int,
     sliding: tuple[bool, ...],
     *,
-    held: bool,
     begins: bool = False,
     slide_spread: float = SLIDE_SPREAD,
 ) -> Felt:
     """Play a generated hand to the gate, and return what the gate says.
 
     The object slides along the fingers that are True in `sliding` from the start, or from a drawn
-    time after closing if `begins`. `held`: sweeps repeat values, as a palm's do. `slide_spread`:
-    how much slides differ in speed; 0: not at all.
+    time after closing if `begins`. `slide_spread`: how much slides differ in speed; 0: not at all.
     """
     rng = np.random.default_rng([seed, 4])
     closed_s = REST_S + CLOSES_S
@@ -112,7 +108,7 @@ def feel(
     begins_s = slide_s if begins else None
     hold = Hold(sliding, rng, closed_s + HOLDS_S, closed_s, begins_s, slide_spread)
     rest = np.full((len(FINGERS), ELECTRODES), REST_COUNTS)
-    sampler = Sampler(rest, HeldNoise(len(FINGERS), rng).sweep, held=held)
+    sampler = Sampler(rest, HeldNoise(len(FINGERS), rng).sweep, held=False)
     course, hand = Closing(hold, rng), HandTracker(FINGERS, HandLimits())
     stands, slides = [], []
     for row in range(round(100 * (closed_s + HOLDS_S))):
@@ -125,19 +121,18 @@ def feel(
     return Felt(np.array(stands[CLOSED:]), np.array(slides[CLOSED:]), slides_at)
 
 
-def cells(episodes: int, *, held: bool) -> list[str]:
-    """Return a row of the table, each figure of `episodes` hands; `held`: as in `feel`."""
+def cells(episodes: int) -> list[str]:
+    """Return the row of the table, each figure of `episodes` hands."""
     seeds = range(episodes)
-    holds = [feel(seed, NONE, held=held) for seed in seeds]
-    slides = [feel(seed, THREE, held=held) for seed in seeds]
-    begun = [feel(seed, THREE, held=held, begins=True) for seed in seeds]
+    holds = [feel(seed, NONE) for seed in seeds]
+    slides = [feel(seed, THREE) for seed in seeds]
+    begun = [feel(seed, THREE, begins=True) for seed in seeds]
     three, one = (
-        [feel(seed, fingers, held=held, begins=True, slide_spread=0.0) for seed in seeds]
+        [feel(seed, fingers, begins=True, slide_spread=0.0) for seed in seeds]
         for fingers in (THREE, ONE)
     )
     revoked = [each.revoked_ms for each in begun if each.revoked_ms is not None]
     return [
-        "held" if held else "fresh",
         percent(np.concatenate([hold.stands[hold.stood :] for hold in holds])),
         percent(np.array([slide.stands for slide in slides])),
         percent(np.array([slide.stands.any() for slide in slides])),
@@ -159,8 +154,7 @@ def times(found_ms: list[float]) -> str:
 
 def main(episodes: int) -> None:
     """Print the table."""
-    rows = [cells(episodes, held=held) for held in (True, False)]
-    sys.stdout.write("\n".join(markdown_table(HEAD, rows)) + "\n")
+    sys.stdout.write("\n".join(markdown_table(HEAD, [cells(episodes)])) + "\n")
 
 
 if __name__ == "__main__":
