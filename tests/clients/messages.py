@@ -12,11 +12,6 @@ TOPIC = b"verdict.right"
 MS = 1_000_000
 MAX_AGE_NS = 100 * MS
 """Largest age of a reading that permits a lift, ns."""
-NEEDED = (
-    "v", "boot_id", "seq", "t_mono_ns", "grasp", "verdict", "verdict_code", "p_slip", "valid",
-    "reasons", "age_ms", "silence_ms",
-)  # fmt: skip
-"""Fields that a lift relies on."""
 RISK = {
     "target": 0.05, "lifts": 41, "slips": 2, "outstanding": 1, "bound": 6.1, "warm_up_left": 0,
     "announced": 40, "awaited": 1,
@@ -161,7 +156,7 @@ def _spoiled(draw: st.DrawFn, message: dict[str, Any]) -> list[bytes]:
 
     Wrong frames are in golden/refused.json.
     """
-    name = draw(st.sampled_from([*NEEDED, *ADDED]))
+    name = draw(st.sampled_from([*verdict(), *ADDED]))
     if draw(st.integers(0, 3)):
         return frames(message | {name: draw(_anything)})
     return frames({key: value for key, value in message.items() if key != name})
