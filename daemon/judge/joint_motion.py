@@ -95,7 +95,9 @@ class JointMotion:
 
     def misses_some(self, t_ns: int) -> bool:
         """Return True if joints are missing at `t_ns` and judging continues without them."""
-        return self.is_lost(t_ns) or bool(set(self.lost).difference(*self.past))
+        # Angles that all come that late are forgotten at each sweep, and come again.
+        late = any(t_ns - at_ns > LOST_NS for at_ns in self.latest_ns.values())
+        return late or self.is_lost(t_ns) or bool(set(self.lost).difference(*self.past))
 
     @property
     def is_frozen(self) -> bool:

@@ -13,14 +13,17 @@ from numpy.typing import NDArray
 from graspd.drivers.base import ANGLE_MAX_RAD, JointReading, joint_name
 from graspd.drivers.datagrams.messages import (
     DATAGRAM_BYTES_MAX,
+    LEAPS,
     SILENCE_NS,
     MessageCounters,
     Order,
     Stamp,
+    drop,
     number,
     read_message,
     write_message,
 )
+from graspd.drivers.link import SenderClock
 from graspd.drivers.udp import DatagramDriver
 
 _joint_of: Final = functools.lru_cache(maxsize=64)(joint_name)
@@ -59,24 +62,36 @@ class JointStream:
     def __init__(self) -> None:
         self.counters = JointCounters()
         self._order = Order(self.counters)
+        self._clock = SenderClock()
+        self._interrupted = False
 
     def interrupt(self) -> None:
         """Do nothing: the last number and time stay, so that no old message is mistaken for new."""
 
     def receive(self, data: bytes, t_ns: int) -> list[JointReading] | None:
-        """Return the reading of a message; [] if no joint is known; None if it is dropped.
+        """Return the reading of a message that arrived at `t_ns`; [] if no joint is known; None if
+        it is dropped.
 
-        `t_ns`: time of arrival, which becomes the reading's.
+        The reading's time is when the message was made, by its `t` and the quickest message.
         """
-        message, restarts = self.parse(data), self.counters.restarts
+        counters = self.counters
+        message, restarts = self.parse(data), counters.restarts
         if message is None or not self._order.admits(message.stamp):
+            return None
+        self._interrupted |= counters.restarts > restarts
+        leaps = self._clock.leaps(message.stamp.t_s, t_ns)
+        made_ns = self._clock.made_ns(message.stamp.t_s, t_ns)
+        if leaps:
+            drop(data, LEAPS, counters)
+            self._interrupted = True
             return None
         if not message.names:
             return []
-        seq = self.counters.readings + self.counters.missed_readings
-        self.counters.readings += 1
-        names, angles, restarted = message.names, message.position_rad, self.counters.restarts
-        return [JointReading(t_ns, seq, names, angles, interrupted=restarted > restarts)]
+        seq = counters.readings + counters.missed_readings
+        counters.readings += 1
+        names, angles = message.names, message.position_rad
+        interrupted, self._interrupted = self._interrupted, False
+        return [JointReading(made_ns, seq, names, angles, interrupted=interrupted)]
 
     def parse(self, data: bytes) -> JointMessage | None:
         """Return the message of a datagram; None, and count it, if it is not valid."""

@@ -24,6 +24,8 @@ SEQ_JUMP_MAX: Final = 1000
 OLD_MESSAGES_MAX: Final = 10
 """Most old messages in a row, each newer than the last, that count as delayed. With one more the
 sender has restarted."""
+LEAPS: Final = "`t` leaps: is it in seconds?"
+"""Why a message is dropped whose time `SenderClock.leaps`."""
 
 _log = logging.getLogger(__name__)
 

@@ -14,6 +14,7 @@ from graspd.biotac import COUNT_MAX, ELECTRODES, FINGERS
 from graspd.drivers.base import ElectrodeFault, TactileReading
 from graspd.drivers.datagrams.messages import (
     DATAGRAM_BYTES_MAX,
+    LEAPS,
     SHOWN_BYTES_MAX,
     SILENCE_NS,
     Message,
@@ -87,7 +88,7 @@ class TactileStream:
         leaps = self._clock.leaps(message.stamp.t_s, t_ns)
         made_ns = self._clock.made_ns(message.stamp.t_s, t_ns)
         if leaps:
-            drop(data, "`t` leaps: is it in seconds?", counters)
+            drop(data, LEAPS, counters)
             self._interrupted = True
             return None
         counters.late_messages += t_ns - made_ns > LATE_NS

@@ -77,6 +77,22 @@ def test_silent_joints_are_late_after_150_ms_then_lost(
     assert not motion.is_frozen
 
 
+@pytest.mark.parametrize(
+    ("delay_ms", "reason", "is_missing"),
+    [(150, None, False), (500, Reason.JOINTS_LATE, False), (1500, None, True)],
+)
+def test_joints_that_all_come_late_count_as_silent_ones(
+    delay_ms: int, reason: Reason | None, is_missing: bool
+) -> None:
+    motion, now_ns = turning(100.0, 0.0)
+    for ms in range(10, 3000, 10):
+        now_ns += 10 * MS
+        send(motion, now_ns - min(ms, delay_ms) * MS, 0.3, 1.2, -0.1)
+    assert motion.misses_some(now_ns - 10 * MS) is is_missing, "also before the next sweep"
+    assert motion.objection(now_ns) is reason
+    assert motion.misses_some(now_ns) is is_missing
+
+
 def test_joints_that_have_sent_nothing_are_waited_for_one_second() -> None:
     motion, last_ns = turning(100.0, 0.0)
     for waits, now_ns in ((JointMotion(), START_NS), (motion, last_ns - 151 * MS)):

@@ -20,7 +20,7 @@ from graspd.drivers.datagrams.joints import (
 )
 from graspd.drivers.datagrams.messages import Order, Stamp
 from graspd.drivers.link import LinkState
-from tests.drivers.palm.palm_stream import joints
+from tests.drivers.palm.palm_stream import MS, joints
 from tests.drivers.udp_standin import Receiver
 from tests.kit.clock import Clock
 
@@ -134,3 +134,31 @@ def test_the_first_reading_after_a_sender_restart_is_interrupted() -> None:
         readings += stream.receive(message(seq), 0) or []
     # Ten of the old numbers are dropped; 5000 is more than a thousand ahead.
     assert [at for at, reading in enumerate(readings) if reading.interrupted] == [10, 20]
+
+
+@pytest.mark.parametrize(
+    ("sent", "made", "interrupted"),
+    [
+        # Sender's time, s; arrival and the reading's time, ms: a queue fills up and holds 500 ms.
+        ([(5.0, 100), (5.01, 110), (5.02, 620), (5.03, 630)], [100, 110, 120.51, 130.52], None),
+        # No time, one time for all messages, and milliseconds, which leap.
+        ([(None, 100), (None, 110), (None, 620)], [100, 110, 620], None),
+        ([(5.0, 100), (5.0, 110), (5.0, 620)], [100], None),
+        ([(5000.0, 100), (5010.0, 110), (5020.0, 620)], [100], None),
+        # A clock that was set an hour ahead: one message is lost.
+        ([(5.0, 100), (3605.01, 110), (3605.02, 120), (3605.03, 130)], [100, 120, 130], 1),
+    ],
+    ids=["queue", "no time", "time stands", "milliseconds", "clock set"],
+)
+def test_angles_that_waited_in_a_queue_have_their_age(
+    sent: list[tuple[float | None, float]], made: list[float], interrupted: int | None
+) -> None:
+    stream, readings = JointStream(), list[JointReading]()
+    for seq, (t_s, arrival_ms) in enumerate(sent):
+        readings += stream.receive(message(seq, t_s), round(arrival_ms * MS)) or []
+    assert [reading.t_ns / MS for reading in readings] == pytest.approx(made, abs=0.001)
+    assert [at for at, reading in enumerate(readings) if reading.interrupted] == (
+        [] if interrupted is None else [interrupted]
+    )
+    counted = stream.counters.as_dict()
+    assert len(made) + counted["bad_messages"] + counted["old_messages"] == len(sent)
