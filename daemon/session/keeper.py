@@ -356,8 +356,9 @@ def _taught_with(
 
 
 def is_of_unknown_sensors(kept: KeptSession) -> bool:
-    """Return True for a session seeded from recorded grasps: it has no rest and no serials."""
-    return kept.statistics is not None and kept.rest is None and not numbers(kept.serials)
+    """Return True for a session seeded from recorded grasps: it has no rest and no serials, but
+    grasps, which one lacks that ended before the first tare."""
+    return kept.grasps > 0 and kept.rest is None and not numbers(kept.serials)
 
 
 def is_of_sensors(one: KeptSession, other: KeptSession) -> bool:

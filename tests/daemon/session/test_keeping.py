@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import cast
 
+import numpy as np
 import pytest
 
 from graspd.daemon.judge.pipeline import Pipeline
@@ -20,6 +21,8 @@ from graspd.daemon.session.keeper import (
     WAITING_MAX,
     SessionKeeper,
 )
+from graspd.daemon.session.sensors import LOOK_EVERY
+from graspd.daemon.trust.lift_book import OutcomeStatus
 from graspd.daemon.trust.trust import Trust
 from tests.daemon.fakes import Clock
 from tests.daemon.session.learning import (
@@ -140,6 +143,25 @@ def test_a_start_with_other_fingers_keeps_the_former_session(folder: SessionFold
     third = trust("of two fingers", inputs=52)
     SessionKeeper(cast(Pipeline, FakeJudge(None, third)), ("ff", "th"), sensors(), folder, Clock())
     assert third.state() == other.state()
+
+
+def test_the_session_of_a_start_without_readings_continues(
+    folder: SessionFolder, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It was only told an outcome that it did not know, so it has neither grasps nor a rest."""
+    part, later, exchanges = trust(), trust(), list[None]()
+    keeper = session_keeper(calibration(), sensors(), folder, part=part)
+    assert tell(part, 7) is OutcomeStatus.UNKNOWN
+    keeper.save()
+    assert len(kept_in(folder.path)) == 1
+    rest = np.full((3, 24), 2000.0)
+    hears = FakeJudge(calibration(), later, lambda: rest, lambda: exchanges.append(None))
+    keeper = SessionKeeper(cast(Pipeline, hears), FINGERS, sensors(), folder, Clock())
+    for _ in range(LOOK_EVERY):
+        read_once(keeper)
+    keeper.save()
+    assert (exchanges, caplog.messages) == ([], [])
+    assert later.state() == part.state()
 
 
 def test_a_folder_that_cannot_be_made_is_tried_again(
