@@ -24,6 +24,7 @@ from graspd.daemon.scene.drivers import (
     Section,
     SpiTactile,
     Tactile,
+    UdpSection,
     unit,
 )
 from graspd.daemon.scene.endpoints import check_endpoint, clash, is_private
@@ -247,6 +248,8 @@ class Scene(Section):
             raise ValueError("record.raw is for tactile.driver spi and can")
         if isinstance(self.joints, PalmJoints) and not isinstance(tactile, PalmTactile):
             raise ValueError("joints.driver palm needs tactile.driver palm: it is the same stream")
+        if isinstance(tactile, UdpSection) and isinstance(self.joints, UdpSection):
+            _refuse_one_port(tactile.source, self.joints.source)
         return self
 
     def _refuse_strangers(self) -> None:
@@ -303,6 +306,20 @@ class Scene(Section):
     def max_age_ns(self) -> int:
         """Age limit of a reading, ns."""
         return round(self.gate.max_age_ms * 1e6)
+
+
+def _refuse_one_port(tactile: str, joints: str) -> None:
+    """Raise `ValueError` if the two sources, `udp://ADDRESS:PORT`, cannot both be listened on."""
+    from graspd.drivers.udp import Endpoint  # only where it is needed
+
+    try:
+        ends = Endpoint.parse(tactile), Endpoint.parse(joints)
+    except ValueError:
+        return  # the driver says what is wrong
+    if ends[0].port and clash(*map(str, ends)):  # the kernel chooses another port for each 0
+        raise ValueError(
+            f"tactile.source {tactile} and joints.source {joints} must have different ports"
+        )
 
 
 def load(path: Path) -> Scene:

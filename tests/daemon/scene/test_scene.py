@@ -209,6 +209,37 @@ def test_publish_and_ask_endpoints_that_clash_are_refused_however_written(
         parse(sections, tmp_path / "s.toml")
 
 
+@pytest.mark.parametrize(
+    ("counts", "angles", "clash"),
+    [
+        # What Linux binds, and what it refuses with `Address already in use`.
+        ("udp://127.0.0.1:9872", "udp://127.0.0.1:9872", True),
+        ("udp://127.0.0.1:9872", "udp://[::ffff:127.0.0.1]:9872", True),
+        ("udp://0.0.0.0:9872", "udp://127.0.0.1:09872", True),
+        ("udp://127.0.0.1:9872", "udp://[::]:9872", True),
+        ("udp://[::1]:9872", "udp://::1:9872", True),
+        ("udp://127.0.0.1:9872", "udp://127.0.0.1:9871", False),
+        ("udp://127.0.0.1:9872", "udp://127.0.0.2:9872", False),
+        ("udp://127.0.0.1:9872", "udp://[::1]:9872", False),
+        ("udp://127.0.0.1:0", "udp://127.0.0.1:0", False),
+        ("udp://127.0.0.1:9872", "udp://here", False),  # the driver says what is wrong
+    ],
+)
+def test_counts_and_angles_on_one_udp_port_are_refused(
+    counts: str, angles: str, clash: bool, tmp_path: Path
+) -> None:
+    sections = {
+        "tactile": {"driver": "datagrams", "source": counts},
+        "joints": {"driver": "stream", "source": angles},
+    }
+    if not clash:
+        parse(sections, tmp_path / "s.toml")
+        return
+    with pytest.raises(SceneError, match=r"tactile\.source .* and joints\.source .* must") as error:
+        parse(sections, tmp_path / "s.toml")
+    assert "\n" not in str(error.value)
+
+
 def test_a_utf_8_byte_order_mark_is_accepted(tmp_path: Path) -> None:
     path = tmp_path / "s.toml"
     path.write_bytes(b'\xef\xbb\xbf[tactile]\ndriver = "can"\n')
