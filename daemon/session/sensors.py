@@ -101,7 +101,7 @@ class SensorWatch(Companion):
         former = self._with_rest(rest, is_known=before is not None and not moved)
         # A later tare of a single finger may come from one that touches.
         if former is not None or (moved and self._is_first_tare):
-            if moved:
+            if former is None:
                 log.warning(UNTOLD, len(moved))
             self._begin(former, tared=former is not None)
             self._rest = rest

@@ -242,8 +242,10 @@ def test_returning_sensors_get_their_slip_budget_and_outcomes_back(tmp_path: Pat
     assert now.learner.outcomes == 2
 
 
-def test_each_set_of_sensors_without_serials_keeps_its_session(tmp_path: Path) -> None:
-    """Three hands in turn: the session of each is there when it is back."""
+def test_each_set_of_sensors_without_serials_keeps_its_session(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Three hands in turn: the session of each is there when it is back, and the log says so."""
     hands = [PATTERN, HELD, PATTERN - np.linspace(400.0, 0.0, 24)]
     now, session = [hands[0]], calibration()
     with SessionFolder(tmp_path / "right") as folder:
@@ -257,6 +259,9 @@ def test_each_set_of_sensors_without_serials_keeps_its_session(tmp_path: Path) -
                 observe(session, 20 + number, seed=number)
         keeper.save()
     assert found == [0, 0, 0, 20, 21, 22]
+    said = ["treated as other sensors", "these sensors were there before"]
+    logged = [[text for text in said if text in line] for line in caplog.messages]
+    assert logged == [said[:1]] * 2 + [said[1:]] * 3
 
 
 def seed(robot: Robot, day: Day) -> None:
