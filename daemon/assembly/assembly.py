@@ -219,12 +219,17 @@ def _tactile(plan: Plan) -> Driver:
 
 
 def player(
-    plan: Plan, options: ReplayTactile, speed: float | None, *, strict: bool = False
+    plan: Plan,
+    options: ReplayTactile,
+    speed: float | None,
+    *,
+    strict: bool = False,
+    outcomes: bool = False,
 ) -> ReplayDriver | BagDriver | McapReplayDriver:
     """Make the driver that plays a scene's recordings. Raises `ValueError`.
 
     `speed`: factor of real time; None: as fast as possible. `strict`: a value in a table that is
-    not a count ends the replay with an error.
+    not a count ends the replay with an error. `outcomes`: so does an unreadable outcome.
     """
     fingers, kind = plan.scene.hand.fingers, recorded_kind(options)
     if kind in BAGS:
@@ -252,4 +257,5 @@ def player(
         rate_hz=options.rate_hz,
         loop=options.loop,
         strict=strict,
+        outcomes=outcomes or options.outcomes,
     )

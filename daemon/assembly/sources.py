@@ -88,15 +88,16 @@ class Tables(Source):
         rate_hz: float | None = None,
         loop: bool = False,
         strict: bool = False,
+        outcomes: bool = False,
     ) -> None:
         """`sections`: sections of the scene that replace the defaults for playing `paths`.
 
         Not for bags: `read_as`: what the rows are; None: find out. `rate_hz`: rows/s of files
         without times; None: the usual ones. `loop`: start again after the last file. `strict`:
-        a value that is not a count raises.
+        a value that is not a count raises. `outcomes`: so does an outcome that cannot be read.
         """
         self._paths = [path.absolute() for path in paths]
-        self._strict = strict
+        self._refuses = {"strict": strict, "outcomes": outcomes}
         tactile = {"driver": "replay", "recordings": self._paths, "loop": loop}
         changes: dict[str, dict[str, Any]] = {
             "tactile": {**tactile, "read_as": read_as, "rate_hz": rate_hz},
@@ -121,7 +122,7 @@ class Tables(Source):
             _refuse_other_fingers(error.path, error.there, model)
             raise
         options = cast(ReplayTactile, replayed.tactile)
-        driver = assembly.player(plan, options, speed, strict=self._strict)
+        driver = assembly.player(plan, options, speed, **self._refuses)
         parts = Parts.of(plan, model, driver, lambda: driver.handed_over_ns)
         return replace(parts, boot_id=DRAWS)
 

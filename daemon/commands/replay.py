@@ -293,6 +293,7 @@ def _tables(args: argparse.Namespace) -> Tables:
         rate_hz=args.rate_hz,
         loop=args.loop,
         strict=args.strict,
+        outcomes=args.outcomes,
     )
 
 

@@ -8,7 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import numpy as np
@@ -371,16 +371,16 @@ def _judge(plan: Plan, pipeline: Pipeline, unjudged: Unjudged) -> list[Judgement
 
 
 def _readings(plan: Plan) -> Iterator[Reading]:
-    tactile = plan.scene.tactile
-    if isinstance(tactile, scene_drivers.ReplayTactile) and recorded_kind(tactile) is Kind.MCAP:
+    tactile = cast(scene_drivers.ReplayTactile, plan.scene.tactile)
+    if recorded_kind(tactile) is Kind.MCAP:
         yield from _recorded_grasps(tactile.recordings, plan.scene.hand.fingers)
     else:
         yield from _played(plan)
 
 
 def _played(plan: Plan) -> Iterator[Reading]:
-    (driver,) = assembly.build_drivers(plan)
-    with contextlib.closing(driver):
+    tactile = cast(scene_drivers.ReplayTactile, plan.scene.tactile)
+    with contextlib.closing(assembly.player(plan, tactile, None, outcomes=True)) as driver:
         assembly.open_driver(driver)
         while not driver.exhausted:
             yield from driver.read_ready()

@@ -11,7 +11,7 @@ from typing import Final
 from graspd.biotac import ELECTRODES, FINGERS, FORMER_ELECTRODES, Finger
 from graspd.drivers.base import RecordingError, joint_name
 from graspd.drivers.recordings.kinds import PAGE
-from graspd.drivers.recordings.values import are_numbers
+from graspd.drivers.recordings.values import are_numbers, number_of, time_of
 
 TIME: Final = "t"
 """Name of the column of times that graspd writes: seconds since any moment."""
@@ -94,6 +94,17 @@ class TimeColumn:
     places: tuple[int, ...]
     unit_s: float | None
     """Unit of the times, s, if the column's name gives it; else None."""
+
+    def value(self, cells: Sequence[str], *, decimal_comma: bool = False) -> float | None:
+        """Return the time of a row in the unit of the column; None if the row has no time.
+
+        `decimal_comma`: True if a comma stands for the point.
+        """
+        value = time_of(cells[self.places[0]], decimal_comma=decimal_comma)
+        if len(self.places) == 1 or value is None:
+            return value
+        rest_ns = number_of(cells[self.places[1]], decimal_comma=decimal_comma)
+        return None if rest_ns is None else value + rest_ns * 1e-9
 
 
 @dataclass(frozen=True, slots=True)

@@ -60,6 +60,7 @@ class ReplayDriver(ReadingsDriver[tuple[Row, bool]]):
 
     `open` and `read_ready` raise `RecordingError` for a wrong file, header or row. Values that are
     not counts, and a last row without a line end, make a reading faulty; with `strict` they raise.
+    With `outcomes` an unreadable outcome raises; else it is not known, which is logged if all are.
     """
 
     counters: ReplayCounters
@@ -75,6 +76,7 @@ class ReplayDriver(ReadingsDriver[tuple[Row, bool]]):
         read_as: ReadAs | None = None,
         loop: bool = False,
         strict: bool = False,
+        outcomes: bool = False,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """`layouts`: layout of each file, if known. `speed`: factor of real time; None: as fast as
@@ -85,7 +87,7 @@ class ReplayDriver(ReadingsDriver[tuple[Row, bool]]):
         self._find = partial(layout_of, fingers=self._fingers, read_as=read_as, rate_hz=rate_hz)
         self._layouts = dict(layouts or {})
         self._loop = loop
-        self._strict = strict
+        self._refuses = {"strict": strict, "outcomes": outcomes}
 
     def reset(self) -> None:
         super().reset()
@@ -103,6 +105,8 @@ class ReplayDriver(ReadingsDriver[tuple[Row, bool]]):
             if layout.unit_s != 1.0 and layout.columns.time is not None:
                 name, unit = layout.columns.time.name, UNITS[layout.unit_s]
                 _log.info("replay: %s: the times of column %s are in %s", path, name, unit)
+            if layout.unread_outcome and not self._refuses["outcomes"]:
+                _log.warning("no outcome is known: %s", layout.unread_outcome)
         if ignored:
             names = ", ".join(map(repr, list(ignored)[:IGNORED_COLUMNS_LOGGED]))
             _log.info("replay: unknown columns ignored: %d, such as %s", len(ignored), names)
@@ -132,7 +136,7 @@ class ReplayDriver(ReadingsDriver[tuple[Row, bool]]):
     ) -> Generator[tuple[int, tuple[Row, bool]], None, int]:
         """Yield the rows of one file as `_items` does; return the start of the next file, ns."""
         at_ns, first_s, period_ns = start_ns, None, 0
-        rows = read_rows(path, self._fingers, strict=self._strict, layout=self._layouts[path])
+        rows = read_rows(path, self._fingers, layout=self._layouts[path], **self._refuses)
         for index, row in enumerate(rows):
             before_ns = at_ns
             if row.t_s is None:

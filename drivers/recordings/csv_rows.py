@@ -21,7 +21,7 @@ from graspd.drivers.base import ANGLE_MAX_RAD, Annotation, ElectrodeFault
 from graspd.drivers.recordings.cells import Cells
 from graspd.drivers.recordings.columns import SLIPPED
 from graspd.drivers.recordings.kinds import open_recording
-from graspd.drivers.recordings.layout import Layout, survey, time_value
+from graspd.drivers.recordings.layout import Layout, survey
 from graspd.drivers.recordings.values import (
     COUNT_OF_TEXT,
     are_texts,
@@ -150,7 +150,7 @@ class Recording:
             return self._row_number / layout.rate_hz
         if not layout.is_stream or column is None:
             return None
-        value = time_value(column, cells, decimal_comma=self._comma)
+        value = column.value(cells, decimal_comma=self._comma)
         if value is None:
             problem = f"{shown(cells[column.places[0]])} is not a time, such as 12.34 in seconds"
             raise self._cells.error(problem, column.name)

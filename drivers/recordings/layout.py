@@ -17,16 +17,16 @@ from numpy.typing import NDArray
 from graspd.biotac import FINGERS
 from graspd.drivers.base import ANGLE_MAX_RAD, RecordingError
 from graspd.drivers.recordings.cells import Cells
-from graspd.drivers.recordings.columns import Columns, TimeColumn, problem_of_fingers
+from graspd.drivers.recordings.columns import SLIPPED, Columns, TimeColumn, problem_of_fingers
 from graspd.drivers.recordings.kinds import open_recording
 from graspd.drivers.recordings.values import (
+    are_texts,
     count_of,
     is_clock,
     is_outcome,
     number_of,
     outcome_of,
     problem_with,
-    time_of,
 )
 
 ReadAs = Literal["table", "stream"]
@@ -86,9 +86,10 @@ class Layout:
     """Unit of the column of times, s."""
     rate_hz: float | None = None
     """Sweeps per second, in place of times."""
-
     has_outcomes: bool = False
-    """True for a stream with a column of outcomes, or a table with some in its first rows."""
+    """True for a table with outcomes, or a stream, which may begin without, with their column."""
+    unread_outcome: str = ""
+    """Why an outcome cannot be read, in a file of which none can; empty: some can, or are blank."""
 
     @property
     def joints(self) -> Mapping[str, int]:
@@ -125,6 +126,7 @@ def survey(
     columns = Columns.of(path, cells.names, fingers, cells.header_line)
     rows = _Rows(path, columns, cells)
     rows.refuse_values()
+    rows.refuse_outcomes()
     rows.refuse_fingers_by_row()
     if rows.is_timed(read_as, rate_hz):
         if rate_hz is not None and read_as is None and columns.time is not None:
@@ -141,9 +143,12 @@ def survey(
         if repeats is not None:
             raise RecordingError(path, repeats)
         rows.refuse_fingers_below()
+        rows.refuse_outcomes()
         layout = Layout(columns, is_stream=False)
     file.seek(0)
-    return replace(layout, has_outcomes=rows.has_outcomes(layout))
+    has_outcomes = rows.have_outcomes or (layout.is_stream and columns.slipped is not None)
+    unread = "" if rows.have_outcomes or rows.unread is None else str(rows.unread)
+    return replace(layout, has_outcomes=has_outcomes, unread_outcome=unread)
 
 
 def _until_damage(rows: Iterator[list[str]]) -> Iterator[list[str]]:
@@ -158,16 +163,18 @@ class _Rows:
     """The first rows of a file, and what is known of them."""
 
     def __init__(self, path: Path, columns: Columns, cells: Cells) -> None:
-        self.path = path
-        self.columns = columns
-        each = iter(cells)
+        self.path, self.columns = path, columns
+        self._comma = cells.decimal_comma
+        self._electrodes = itemgetter(*columns.electrodes)
+        self.have_outcomes = False
+        self.unread: RecordingError | None = None
+        """Problem of the first outcome so far that cannot be read; `have_outcomes`: one can."""
+        each = self._each(cells)
         first = list(islice(each, 1))
         if not first:
             raise RecordingError(path, "the file has a header and no rows")
         self._others = _until_damage(each)
         self.first = [*first, *islice(self._others, BLOCK_ROWS - 1)]
-        self._comma = cells.decimal_comma
-        self._electrodes = itemgetter(*columns.electrodes)
         self._named = set[str]()
         """Fingers of rows, one more at most than there are."""
         self._note_fingers(self.first)
@@ -175,16 +182,19 @@ class _Rows:
     def refuse_values(self) -> None:
         """Raise `RecordingError` if the values of electrodes are not counts, such as volts."""
         values = [value for cells in self.first for value in self._electrodes(cells)]
-        problem = problem_with(values, decimal_comma=self._comma)
-        if problem is not None:
+        if problem := problem_with(values, decimal_comma=self._comma):
             raise RecordingError(self.path, problem)
+
+    def refuse_outcomes(self) -> None:
+        """Raise if some outcomes so far can be read and others not: one side may be missing."""
+        if self.have_outcomes and self.unread is not None:
+            raise self.unread
 
     def refuse_fingers_by_row(self) -> None:
         """Raise if the rows so far are of several fingers, and would be read as those of one."""
-        if self.columns.finger is not None and len(self._named) <= len(FINGERS):
-            problem = problem_of_fingers(self._named)
-            if problem is not None:
-                raise RecordingError(self.path, problem, column=self.columns.finger[1])
+        problem = problem_of_fingers(self._named) if len(self._named) <= len(FINGERS) else None
+        if self.columns.finger is not None and problem is not None:
+            raise RecordingError(self.path, problem, column=self.columns.finger[1])
 
     def refuse_fingers_below(self) -> None:
         """Read on to the end, if a column may name fingers, and raise if there are several."""
@@ -209,12 +219,6 @@ class _Rows:
             raise RecordingError(self.path, "has no column of times: give --rate-hz too")
         return read_as == "stream" or (read_as is None and self.columns.time is not None)
 
-    def has_outcomes(self, layout: Layout) -> bool:
-        place = self.columns.slipped
-        if place is None or layout.is_stream:  # a stream may begin with an open hand
-            return place is not None
-        return any(is_outcome(row[place]) for row in self.first)
-
     def are_labelled(self) -> bool:
         """Return True if each first row has an object and an outcome, and both outcomes occur."""
         name, slipped = self.columns.object, self.columns.slipped
@@ -224,11 +228,8 @@ class _Rows:
 
     def times(self, column: TimeColumn) -> list[float]:
         """Return the times of the first rows in the unit of the column."""
-        found = [time_value(column, row, decimal_comma=self._comma) for row in self.first]
+        found = [column.value(row, decimal_comma=self._comma) for row in self.first]
         return [value for value in found if value is not None]
-
-    def is_clock(self, column: TimeColumn) -> bool:
-        return is_clock(self.first[0][column.places[0]])
 
     def blocks(self) -> Iterator[NDArray[np.float32]]:
         """Yield the counts of the whole file in blocks, shape (rows, electrodes); NaN: missing."""
@@ -242,6 +243,18 @@ class _Rows:
         counts = _without_gaps(self._counts(self.first))
         steps = _apart(counts[1:], counts[:-1])
         return 2 * int((steps <= STEP_COUNTS).sum()) > len(steps)
+
+    def _each(self, cells: Cells) -> Iterator[list[str]]:
+        """Yield the rows, and note their outcomes."""
+        place = self.columns.slipped
+        for row in cells:
+            if place is not None and (not self.have_outcomes or self.unread is None):
+                try:
+                    self.have_outcomes |= outcome_of(row[place]) is not None
+                except ValueError as error:
+                    if self.unread is None and not are_texts(self._electrodes(row)):
+                        self.unread = cells.error(str(error), SLIPPED)
+            yield row
 
     def _note_fingers(self, rows: Sequence[Sequence[str]]) -> None:
         if self.columns.finger is not None and len(self._named) <= len(FINGERS):
@@ -261,23 +274,9 @@ class _Rows:
         )
 
 
-def time_value(
-    column: TimeColumn, cells: Sequence[str], *, decimal_comma: bool = False
-) -> float | None:
-    """Return the time of a row in the unit of the column; None if the row has no time.
-
-    `decimal_comma`: True if a comma stands for the point.
-    """
-    value = time_of(cells[column.places[0]], decimal_comma=decimal_comma)
-    if len(column.places) == 1 or value is None:
-        return value
-    rest_ns = number_of(cells[column.places[1]], decimal_comma=decimal_comma)
-    return None if rest_ns is None else value + rest_ns * 1e-9
-
-
 def _unit_s(rows: _Rows, column: TimeColumn, times: Sequence[float], step: float) -> float:
     """Return the unit of times, s, by the column's name, their size, or their median `step`."""
-    if rows.is_clock(column):
+    if is_clock(rows.first[0][column.places[0]]):
         return 1.0
     if column.unit_s is not None:
         return column.unit_s

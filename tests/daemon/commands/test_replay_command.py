@@ -122,6 +122,18 @@ def test_a_replayed_table_keeps_the_risk_limit_and_reports_it() -> None:
     assert bare["reasons"].get("unproven") is None
 
 
+def test_a_streams_unreadable_outcome_is_refused_if_told(tmp_path: Path) -> None:
+    header, row, *_ = DEMO_RECORDING.read_text().splitlines()
+    place = header.split(",").index("slipped")
+    cells = row.split(",")
+    cells[place] = "dropped"
+    path = tmp_path / "stream.csv"
+    path.write_text(f"{header}\n{','.join(cells)}\n")
+    refused = graspd("replay", path, "--outcomes")
+    assert refused.returncode == 2
+    assert "line 2, column slipped: 'dropped' is not an outcome" in refused.stderr
+
+
 def test_a_streams_outcome_is_reported_once_after_its_grasp() -> None:
     result = graspd("replay", DEMO_RECORDING, "--outcomes", "--json")
     verdicts = [decode_verdict(line.encode()) for line in result.stdout.splitlines()]

@@ -124,6 +124,21 @@ def test_seeding_a_model_without_session_needs_known_outcomes(tmp_path: Path) ->
     assert document["calibrated"] is False
 
 
+def test_seeding_refuses_outcomes_that_cannot_be_read(tmp_path: Path) -> None:
+    words = {"0": "held", "1": "dropped"}
+    header, *lines = DEMO_TABLE.read_text().splitlines()
+    assert header.split(",")[1] == SLIPPED
+    cells = [line.split(",", 2) for line in lines]
+    rows = [",".join([name, words[outcome], counts]) for name, outcome, counts in cells]
+    table = tmp_path / "words.csv"
+    table.write_text("\n".join([header, *rows, ""]))
+    path = session_scene(tmp_path)
+    refused = graspd("session", "seed", path, table)
+    assert refused.returncode == 2
+    assert "line 2, column slipped: 'dropped' is not an outcome" in refused.stderr
+    assert last_kept(tmp_path / "right") is None
+
+
 def test_seeding_with_learning_off_keeps_what_was_learned(tmp_path: Path) -> None:
     learned = seed(session_scene(tmp_path), DEMO_TABLE)
     assert learned is not None

@@ -177,6 +177,16 @@ def test_a_unit_of_times_other_than_seconds_is_logged(
         assert [record.getMessage().split()[-1] for record in caplog.records] == unit
 
 
+def test_a_table_without_a_readable_outcome_says_so_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    content = table(2, {0: {"slipped": "yes"}, 1: {"slipped": "no"}})
+    play(ReplayDriver([write(tmp_path, content)], speed=None))
+    (record,) = caplog.records
+    assert record.levelname == "WARNING"
+    assert "line 2, column slipped: 'yes' is not an outcome" in record.getMessage()
+
+
 def test_a_bad_row_is_raised_after_the_readings_before_it(tmp_path: Path) -> None:
     path = write(tmp_path, table(2) + b"apple,0,1\n" + table(1))
     clock = Clock()

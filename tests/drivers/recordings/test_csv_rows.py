@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import math
 import os
-import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -122,12 +121,26 @@ def test_a_wrong_recording_is_refused_with_line_and_column(content: bytes, messa
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("label", ["2", "\u0661"])
-def test_an_unreadable_outcome_is_unknown_or_if_needed_refused(label: str) -> None:
-    content = table(2, {1: {"slipped": label}})
-    assert rows_of(content)[1].annotation.slipped is None
-    told = rf"line 3, column slipped: {re.escape(repr(label))} is not an outcome"
-    with pytest.raises(RecordingError, match=told):
+@pytest.mark.parametrize(
+    ("read", "unread"),
+    [
+        *(("stable", "slipped"), ("stable", "unstable"), ("slip", "no slip")),
+        *(("1", "-1"), ("1", "2"), ("0", "\u0661")),
+    ],
+)
+@pytest.mark.parametrize("row", [1, 599])
+def test_outcomes_of_which_only_a_part_is_readable_are_refused(
+    read: str, unread: str, row: int
+) -> None:
+    changes = {each: {"slipped": read} for each in range(600)} | {row: {"slipped": unread}}
+    told = f"line {row + 2}, column slipped: {unread!r} is not an outcome: 0, False or stable; 1, "
+    assert told in refusal(table(600, changes))
+
+
+def test_unreadable_outcomes_alone_are_unknown_unless_needed() -> None:
+    content = table(3, {0: {"slipped": "yes"}, 1: {"slipped": ""}, 2: {"slipped": "no"}})
+    assert [row.annotation.slipped for row in rows_of(content)] == [None] * 3
+    with pytest.raises(RecordingError, match=r"line 2, column slipped: 'yes' is not an outcome"):
         rows_of(content, outcomes=True)
 
 
