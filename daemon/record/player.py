@@ -26,7 +26,7 @@ from graspd.daemon.record.topics import (
 )
 from graspd.drivers.base import DriverCounters, Reading, RecordingError, TactileReading
 from graspd.drivers.recordings.kinds import open_recording
-from graspd.drivers.recordings.player import ReadingsDriver
+from graspd.drivers.recordings.player import ReadingsDriver, within_limits
 
 _log = logging.getLogger(__name__)
 
@@ -111,7 +111,7 @@ class McapReplayDriver(ReadingsDriver[_Item]):
                         if boot_id not in message.payload:
                             raise RecordingError(path, SEVERAL)
                     if item is not None:
-                        yield message.at_ns, item
+                        yield within_limits(path, message.at_ns), item
                 if recording.cut_off:
                     self.counters.cut_off += 1
                     _log.warning("%s: is cut off or damaged; played up to there", path)

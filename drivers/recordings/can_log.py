@@ -28,7 +28,7 @@ from graspd.drivers.recordings.kinds import (
     open_recording,
     reason,
 )
-from graspd.drivers.recordings.player import LinkLogDriver
+from graspd.drivers.recordings.player import LinkLogDriver, within_limits
 
 NS_PER_US: Final = 1000
 FIRST_LINES: Final = 20_000
@@ -243,7 +243,7 @@ class CanLog(LinkLogDriver[CanFrame]):
             if logged.frame is None:
                 self.stream.counters.malformed_frames += 1
                 continue
-            yield self._going_on(since_ns), logged.frame
+            yield within_limits(path, self._going_on(since_ns), number), logged.frame
         if strange:
             text = "%s: %d of %d lines were not understood; the first is %s"
             _log.warning(text, path, strange, lines, first)

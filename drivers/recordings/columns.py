@@ -51,6 +51,8 @@ _UNIT_S: Final = {
     **dict.fromkeys(("us", "\u00b5s", "\u03bcs", "usec", "usecs", "micros", "microseconds"), 1e-6),
     **dict.fromkeys(("ns", "nsec", "nsecs", "nanosec", "nanosecs", "nanoseconds"), 1e-9),
 }
+_PARTS_S: Final = frozenset((1.0, 1e-9))
+"""Units of the two columns of a time in whole seconds and nanoseconds, s."""
 _UNITS: Final = "|".join(sorted(_UNIT_S, key=len, reverse=True))
 _CLOCKS: Final = (
     "abs|absolute|elapsed|epoch|gps|host|local|log|msg|pc|publish|receive|received|record|recorded"
@@ -61,7 +63,7 @@ _TIMES: Final = (
     "|zeit|zeitstempel|tiempo|temps"
 )
 _TIME_NAME: Final = re.compile(
-    rf"(?P<before>(?:.*[./])?[%_]*(?:(?:{_CLOCKS})[._ ]*)?(?:{_TIMES})(?:_utc)?[ _./(\[]*)?"
+    rf"(?P<before>(?:.*[./])?[%_]*(?:(?:{_CLOCKS})[._ ]*)?(?:{_TIMES})s?(?:_utc)?[ _./(\[]*)?"
     rf"(?P<unit>{_UNITS})?(?:[)\]]|\(\))?",
     re.IGNORECASE,
 )
@@ -315,12 +317,17 @@ def time_column(names: Sequence[str]) -> TimeColumn | None:
     if not found:
         return None
     place, match = found[0]
+    words = {
+        (also["unit"] or "").lower(): other
+        for other, also in found
+        if also["before"] == match["before"]
+    }
+    # `t_s` and `t_ns` are whole times each, `secs` and `nsecs` the parts of one.
+    parts = {_UNIT_S[word]: other for word, other in words.items() if "sec" in word}
     unit_s = None if match["unit"] is None else _UNIT_S[match["unit"].lower()]
-    if unit_s == 1.0:
-        for other, also in found[1:]:
-            unit = _UNIT_S.get((also["unit"] or "").lower())
-            if unit == 1e-9 and also["before"] == match["before"]:
-                return TimeColumn(names[place], (place, other), unit_s)
+    if place in parts.values() and unit_s in _PARTS_S and parts.keys() >= _PARTS_S:
+        seconds, rest_ns = parts[1.0], parts[1e-9]
+        return TimeColumn(names[seconds], (seconds, rest_ns), 1.0)
     return TimeColumn(names[place], (place,), unit_s)
 
 

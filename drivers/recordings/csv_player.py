@@ -20,7 +20,7 @@ from graspd.drivers.base import (
 )
 from graspd.drivers.recordings.csv_rows import Row, read_rows
 from graspd.drivers.recordings.layout import Layout, ReadAs, layout_of
-from graspd.drivers.recordings.player import ReadingsDriver
+from graspd.drivers.recordings.player import ReadingsDriver, within_limits
 
 DEMO_TABLE = Path(__file__).parent / "demo" / "synthetic_grasps.csv"
 """Table of synthetic grasps. `python -m tests.kit.demos` makes all four demos again."""
@@ -147,7 +147,8 @@ class ReplayDriver(ReadingsDriver[tuple[Row, bool]]):
                 at_ns = start_ns + 1000 * round((row.t_s - first_s) * 1e6)
             if at_ns > before_ns:
                 period_ns = min(at_ns - before_ns, period_ns or at_ns)
-            yield at_ns, (row, index == 0 < start_ns and row.t_s is not None)
+            is_new = index == 0 < start_ns and row.t_s is not None
+            yield within_limits(path, at_ns, row.annotation.line), (row, is_new)
         return at_ns + (period_ns or round(self._table_period_ns))
 
     def _readings(self, row: Row, at_ns: int, interrupted: bool) -> Iterator[Reading]:

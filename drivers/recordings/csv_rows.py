@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,10 @@ from graspd.drivers.recordings.values import (
     outcome_of,
     shown,
 )
+
+TIME_SPAN_MAX_S: Final = 4e9
+"""Longest time between a row and the first, s. A clock that is set jumps by up to 1.8e9 s, from
+1970 on; nanoseconds of 64 bits end at 9.2e9 s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +81,7 @@ class Recording:
         self._shape = len(columns.electrodes) // ELECTRODES, ELECTRODES
         self._joints = tuple(self.layout.joints)
         self._t_s = -math.inf
+        self._first_s: float | None = None
         self._row_number = 0
 
     def __iter__(self) -> Iterator[Row]:
@@ -157,6 +162,10 @@ class Recording:
         t_s = value * layout.unit_s
         if t_s < self._t_s:
             problem = f"time goes backwards, from {self._t_s} s to {t_s} s"
+            raise self._cells.error(problem, column.name)
+        self._first_s = t_s if self._first_s is None else self._first_s
+        if t_s - self._first_s > TIME_SPAN_MAX_S:
+            problem = f"{t_s:.12g} s is too far from the first time, {self._first_s:.12g} s"
             raise self._cells.error(problem, column.name)
         self._t_s = t_s
         return t_s

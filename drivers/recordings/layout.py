@@ -281,8 +281,8 @@ def _unit_s(rows: _Rows, column: TimeColumn, times: Sequence[float], step: float
     if column.unit_s is not None:
         return column.unit_s
     usual = [unit for unit in (1.0, 1e-3, 1e-6, 1e-9) if STEP_S[0] <= step * unit <= STEP_S[1]]
-    largest = max(map(abs, times), default=0.0)
-    epoch = next((unit for least, unit in EPOCHS if largest > least), None)
+    usual_size = abs(statistics.median(times)) if times else 0.0  # one may be a missing value
+    epoch = next((unit for least, unit in EPOCHS if usual_size > least), None)
     return epoch or (usual[0] if usual else 1.0)
 
 

@@ -6,7 +6,7 @@ import time
 from abc import abstractmethod
 from collections.abc import Callable, Generator, Iterator, Sequence
 from pathlib import Path
-from typing import Generic, Protocol, TypeVar
+from typing import Final, Generic, Protocol, TypeVar
 
 import msgspec
 
@@ -14,6 +14,19 @@ from graspd.drivers.base import DriverCounters, Fact, Opened, Reading, Recording
 from graspd.drivers.recordings.kinds import open_recording
 
 Item = TypeVar("Item")
+TIME_MAX_NS: Final = 9 * 10**18
+"""Latest time, ns, which is in 2255. Integers of 64 bits end at 9.22e18."""
+
+
+def within_limits(path: Path, t_ns: int, line: int | None = None) -> int:
+    """Return `t_ns`. Raises `RecordingError` if it is later than `TIME_MAX_NS`.
+
+    `line`: line of the file that has this time.
+    """
+    if t_ns > TIME_MAX_NS:
+        problem = f"the time {t_ns / 1e9:.12g} s is later than any: {TIME_MAX_NS / 1e9:.12g} s"
+        raise RecordingError(path, problem, line=line)
+    return t_ns
 
 
 class RecordedDriver(Opened, Generic[Item]):

@@ -16,7 +16,7 @@ from typing import Final
 from graspd.drivers.base import Reading
 from graspd.drivers.link import LinkState
 from graspd.drivers.recordings.kinds import open_recording
-from graspd.drivers.recordings.player import LinkLogDriver
+from graspd.drivers.recordings.player import LinkLogDriver, within_limits
 from graspd.drivers.spi.conversation import Conversation, LineEvent
 from graspd.drivers.spi.messages import FrameCounters, FrameParser, encode_frame
 
@@ -78,7 +78,8 @@ class SerialLog(LinkLogDriver[Record]):
         parser, first_end = FrameParser(), 0
         with open_recording(path) as stream:
             while chunk := stream.read(CHUNK_BYTES):
-                yield from parse_records(parser, chunk)
+                for t_ns, record in parse_records(parser, chunk):
+                    yield within_limits(path, t_ns), record
                 if not first_end and _damaged(parser.counters):
                     first_end = parser.counters.bytes
         if damaged := _damaged(parser.counters):

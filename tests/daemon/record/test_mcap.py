@@ -185,6 +185,21 @@ def test_damage_raises_recording_error_or_nothing(changes: list[tuple[int, int]]
         read(bytes(data))
 
 
+def test_a_message_of_a_time_beyond_64_bits_is_refused(tmp_path: Path) -> None:
+    file = McapWriter(tmp_path / "a.mcap", header("ff", joints=False))
+    payload = {
+        **{"v": 1, "boot_id": BOOT, "seq": 1, "t": 0.0, "t_mono_ns": 5},
+        **{"fingers": ["ff"], "counts": [1] * 24, "faults": [0] * 24},
+    }
+    file.write(b"tactile.right", json.dumps(payload).encode(), 17 * 10**18)
+    file.close()
+    with (
+        McapReplayDriver([tmp_path / "a.mcap"], ("ff",)) as driver,
+        pytest.raises(RecordingError, match=r"a.mcap: the time 17000000000 s is later"),
+    ):
+        driver.read_ready()
+
+
 def test_malformed_readings_are_counted_and_left_out(tmp_path: Path) -> None:
     file = McapWriter(tmp_path / "a.mcap", header("ff", joints=False))
     good = {

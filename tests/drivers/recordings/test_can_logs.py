@@ -234,3 +234,10 @@ def test_a_log_clock_set_back_plays_as_a_pause(tmp_path: Path) -> None:
     times_ns = [reading.made_ns for reading in readings]
     assert times_ns == sorted(times_ns)
     assert len([reading for reading in readings if not reading.faults.any()]) == 5
+
+
+def test_a_time_beyond_64_bits_is_refused_with_its_line(tmp_path: Path) -> None:
+    path = tmp_path / "bus.log"
+    path.write_text("".join([*lines_of(1), *lines_of(1, since_ns=91_700_000_000 * 10**9)]))
+    with pytest.raises(RecordingError, match=r"bus.log, line 25: the time 91700000000 s is later"):
+        played([path])

@@ -187,6 +187,13 @@ def test_a_table_without_a_readable_outcome_says_so_once(
     assert "line 2, column slipped: 'yes' is not an outcome" in record.getMessage()
 
 
+def test_files_that_together_last_too_long_are_refused(tmp_path: Path) -> None:
+    path = write(tmp_path, stream(["0", "3500000000"]))
+    assert len(play(ReplayDriver([path], read_as="stream", speed=None))) == 2
+    with pytest.raises(RecordingError, match=r"line 3: the time 10500000000 s is later"):
+        play(ReplayDriver([path] * 2, read_as="stream", speed=None))
+
+
 def test_a_bad_row_is_raised_after_the_readings_before_it(tmp_path: Path) -> None:
     path = write(tmp_path, table(2) + b"apple,0,1\n" + table(1))
     clock = Clock()

@@ -105,6 +105,14 @@ BAD_FILES = {
         stream(["5", "5.01", "5.0"]),
         "line 4, column t: time goes backwards, from 5.01 s to 5.0 s",
     ),
+    "a missing time of 64 bits": (
+        stream([*(f"1700000000{n}0000000" for n in range(10, 50)), "18446744073709551615"]),
+        "line 42, column t: 18446744073.7 s is too far from the first time, 1700000000.1 s",
+    ),
+    "a missing time among seconds": (
+        stream([*(f"{n / 100}" for n in range(40)), "9223372036854775807"]),
+        "line 42, column t: 9.22337203685e+18 s is too far from the first time, 0 s",
+    ),
     "joint twice": (
         stream(["0"], {"rh_FFJ3": ["0"], "FFJ3": ["0"]}),
         "line 1, column FFJ3: this column is there twice, as rh_FFJ3 too",

@@ -263,6 +263,13 @@ def timed(name: str, cells: Sequence[str], separator: str = ",") -> bytes:
         ("time", [f"1 days 00:00:20.{n:02}" for n in range(4)]),
         ("datetime_utc", [f"2023-11-14 22:13:20.{n:02}0 UTC" for n in range(4)]),
         ("secs,nsecs", [f"1700000000,{n}0000000" for n in range(4)]),
+        ("stamp.nanosec,stamp.sec", [f"{n}0000000,1700000000" for n in range(4)]),
+        ("t_s,t_ns", [f"0.0{n},{n}0000000" for n in range(4)]),
+        ("ts", [f"{1.7e18 + n * 1e7:.0f}" for n in range(4)]),
+        ("timestamps", [f"{1.7e18 + n * 1e7:.0f}" for n in range(4)]),
+        ("timestamps_ms", ["5", "15", "25", "35"]),
+        ("ts", TIMES),
+        ("times_s", TIMES),
     ],
 )
 def test_times_are_known_by_usual_names_and_units(name: str, cells: Sequence[str]) -> None:

@@ -233,6 +233,13 @@ def test_damaged_records_are_counted_and_the_first_is_located(
     assert "2 of 200 records were damaged; the first is before byte 12288" in caplog.text
 
 
+def test_a_record_of_a_time_beyond_64_bits_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "line.serial"
+    path.write_bytes(encoded([(2**64 - 1, (LineEvent.RECEIVED, b"a"))]))
+    with pytest.raises(RecordingError, match=r"line.serial: the time 18446744073.7 s is later"):
+        list(SerialLog([path], ("ff", "mf", "th")).records(path))
+
+
 @pytest.mark.parametrize("content", [b"", b"no frames\n" * 1000])
 def test_a_file_without_anything_from_a_link_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "link.serial"
