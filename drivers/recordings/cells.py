@@ -56,8 +56,8 @@ class Cells:
             raise RecordingError(path, f"is {kind.value}, not a table or stream")
         self.header_line = 1
         self._rows = self._parquet(file) if kind is Kind.PARQUET else self._text(file)
-        self.names = [name.strip() for name in next(self._rows)]
-        """The header."""
+        self.names = [" ".join(name.split()) for name in next(self._rows)]
+        """The header, with a space for each line break within a name."""
         while self.names and not self.names[-1]:
             self.names.pop()
 
@@ -113,6 +113,7 @@ class Cells:
         separator, comment, above, titles = "", "", "", list[tuple[int, str]]()
         header, below = list[str](), list[str]()
         while not header and len(titles) <= TITLE_LINES_MAX and (line := next(lines, "")):
+            line, lines = self._with_breaks(line, lines)
             text = line.strip()
             if self.line == 1 and (match := _SEPARATOR_LINE.fullmatch(text)):
                 separator = match[1]
@@ -135,6 +136,26 @@ class Cells:
             self.header_line, first = titles[0]
             header = [first]
         return separator or _separator(header[-1]), header, chain(below, lines)
+
+    def _with_breaks(self, line: str, lines: Iterator[str]) -> tuple[str, Iterator[str]]:
+        """Return a header with those of `lines` in which its quoted names continue, and the rest.
+
+        Any other line, such as a title with a single quotation mark, comes back as it is.
+        """
+        text, start, held = line, (self.line, self.has_end), list[tuple[int, bool, str]]()
+        while text.count('"') % 2 and len(text) <= LINE_LENGTH_MAX and (more := next(lines, "")):
+            held.append((self.line, self.has_end, more))
+            text += more
+        if text.count('"') % 2 == 0 and has_electrodes(_split(text, "")):
+            return text, lines
+        self.line, self.has_end = start
+        return line, chain(self._again(held), lines)
+
+    def _again(self, held: Sequence[tuple[int, bool, str]]) -> Iterator[str]:
+        """Yield lines that were read before, with their number and whether they have an end."""
+        for number, has_end, line in held:
+            self.line, self.has_end = number, has_end
+            yield line
 
     def _row_lines(self, lines: Iterator[str], separator: str, number: int) -> Iterator[str]:
         """Yield rows as lines, without comments. A row of several lines has the length limit of a
@@ -204,7 +225,8 @@ def _separator(header: str) -> str:
 
 def _split(text: str, separator: str) -> list[str]:
     """Return the cells of a header; `separator`: empty if it is not known."""
-    return [cell.strip(' "') for cell in text.strip().split(separator or _separator(text))]
+    cells = text.strip().split(separator or _separator(text))
+    return [" ".join(cell.strip(' "').split()) for cell in cells]
 
 
 def _name_fingers(cells: Sequence[str]) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -70,6 +71,10 @@ _TIME_NAME: Final = re.compile(
 _IN_UNIT: Final = re.compile(rf"(?P<before>.*)[(\[](?P<unit>{_UNITS})[)\]]", re.IGNORECASE)
 _UNIT: Final = re.compile(r"\s*[(\[]([^\W\d][^)\]]*|-)[)\]]")
 """A unit in brackets after the name of a column."""
+_REMARK: Final = re.compile(
+    r"(?<=object)\s*[(\[][^)\]]*[)\]]$|(?<=slipped)\s*[(\[][^)\]a-z]*[)\]]$"
+)
+"""A remark after a label, as in `object (name)` and `slipped (0/1)`; `slipped (mm)` is a length."""
 _OF_A_FINGER: Final = re.compile(
     r"(?:finger(?:[_ ]?tip)?|digit|sensor|biotac|tip)(?:[_ ]?(?:name|id|no|nr|index))?|frame_id",
     re.IGNORECASE,
@@ -149,10 +154,11 @@ class Columns:
                 joints[joint] = place
         time = time_column(names)
         single: dict[str, int] = {}
+        labels = _labels(names)
         for place, name in enumerate(names):
             is_time = time is not None and name == time.name
-            if is_time or name.lower() in (OBJECT, SLIPPED):  # in letters of any case
-                key = name if is_time else name.lower()
+            if is_time or labels[place] in (OBJECT, SLIPPED):
+                key = name if is_time else labels[place]
                 _refuse_twice(path, names, line, single.get(key), place)
                 single[key] = place
         known = {*joints.values(), *single.values(), *(() if time is None else time.places)}
@@ -171,6 +177,14 @@ class Columns:
             finger=finger_column(names) if len(every) == 1 else None,
             names_finger=not any(map(SCHEMES["E1"].fullmatch, plain)),
         )
+
+
+def _labels(names: Sequence[str]) -> list[str]:
+    """Return names in small letters, without a remark in brackets unless they differ by it."""
+    whole = [name.lower() for name in names]
+    bare = [_REMARK.sub("", name) for name in whole]
+    number = Counter(bare)
+    return [each if number[each] == 1 else name for name, each in zip(whole, bare, strict=True)]
 
 
 def has_electrodes(names: Sequence[str]) -> bool:

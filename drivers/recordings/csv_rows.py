@@ -26,6 +26,7 @@ from graspd.drivers.recordings.values import (
     COUNT_OF_TEXT,
     are_texts,
     count_of,
+    has_thousands,
     number_of,
     outcome_of,
     shown,
@@ -162,6 +163,9 @@ class Recording:
         t_s = value * layout.unit_s
         if t_s < self._t_s:
             problem = f"time goes backwards, from {self._t_s} s to {t_s} s"
+            if self._comma and has_thousands(cells[column.places[0]]):
+                cell = shown(cells[column.places[0]])
+                problem += f"; has {cell} a separator of thousands? write times without one"
             raise self._cells.error(problem, column.name)
         self._first_s = t_s if self._first_s is None else self._first_s
         if t_s - self._first_s > TIME_SPAN_MAX_S:

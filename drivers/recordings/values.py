@@ -62,6 +62,11 @@ def count_of(cell: str, *, decimal_comma: bool = False) -> int | None:
     return int(number)
 
 
+def has_thousands(cell: str) -> bool:
+    """Return True for a number whose comma may separate thousands, as that of `1,250`."""
+    return "," in cell and _THOUSANDS.fullmatch(cell.strip()) is not None
+
+
 def time_of(cell: str, *, decimal_comma: bool = False) -> float | None:
     """Return a time: a number in any unit, or seconds of a date, clock or span; None: neither."""
     number = number_of(cell, decimal_comma=decimal_comma)

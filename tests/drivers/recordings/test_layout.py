@@ -45,6 +45,16 @@ DIALECTS = {
     "UTF-16 without a mark": PLAIN.decode().encode("utf-16-le"),
     "UTF-16 without a mark, big end": PLAIN.decode().encode("utf-16-be"),
     "UTF-32": PLAIN.decode().encode("utf-32"),
+    "breaks in names": text(
+        lambda it: (
+            it.replace("slipped", '"Slipped\n(0/1)"', 1)
+            .replace("object", '"object\r\n(name)"', 1)
+            .replace("th_biotac_24", '"th\nbiotac\n24"', 1)
+        )
+    ),
+    "a break in each name": text(lambda it: re.sub(r"(ff|mf|th)_biotac_(\d+)", '"\\1\ne\\2"', it)),
+    "an inch in a title": b'Pad of 5" at 2026\n' + PLAIN,
+    "an inch and names in quotes": b'5" pad\n' + text(lambda it: re.sub(r"(\w+_\d+)", r'"\1"', it)),
     "titles": b"Lab A; run 3\n\nDate:,2026-05-04\n" + PLAIN,
     "thirty titles": b"Lab A\n\n" * 30 + PLAIN,
     "units below": PLAIN.replace(b"24\n", b"24\n,-" + b",counts" * 72 + b"\n", 1),
@@ -80,6 +90,22 @@ def test_a_name_in_quotes_may_have_line_breaks() -> None:
     names = [row.annotation.object_name for row in rows_of(content)]
     assert names == ["thing_0", "thing\r\none, # 1", "thing_2", "thing_3"]
     assert rows_of(content)[2].annotation.line == 5
+
+
+@pytest.mark.parametrize(
+    ("change", "line"), [(("ff_biotac_1,", '"ff\nbiotac\n1",'), 4), (("", '5"\n'), 3)]
+)
+def test_rows_keep_their_lines_below_quotation_marks(change: tuple[str, str], line: int) -> None:
+    rows = rows_of(text(lambda it: it.replace(*change, 1)))
+    assert [row.annotation.line for row in rows] == [line, line + 1, line + 2, line + 3]
+
+
+@pytest.mark.parametrize("name", ["object (id)", "slipped (mm)"])
+def test_a_further_column_like_a_label_is_ignored(name: str) -> None:
+    content = text(lambda it: re.sub("^", "7.5,", it, flags=re.MULTILINE)).replace(
+        b"7.5,", name.encode() + b",", 1
+    )
+    assert values(rows_of(content.removesuffix(b"7.5,"))) == values(rows_of(PLAIN))
 
 
 def test_a_row_beginning_with_a_hash_is_refused_unless_quoted() -> None:
@@ -276,6 +302,13 @@ def test_times_are_known_by_usual_names_and_units(name: str, cells: Sequence[str
     rows = rows_of(timed(name, cells))
     steps = np.diff([math.nan if row.t_s is None else row.t_s for row in rows])
     assert steps == pytest.approx([0.01, 0.01, 0.01], abs=1e-6)
+
+
+def test_a_time_with_thousands_is_named_as_a_possible_cause() -> None:
+    ms = [*(f"{n}" for n in range(500, 1000, 10)), "1,000"]
+    message = refusal(timed("time_ms", ms, "\t").replace(b"1\t000", b"1,000"))
+    assert "line 52, column time_ms: time goes backwards" in message
+    assert "has '1,000' a separator of thousands? write times without one" in message
 
 
 def test_times_may_have_a_decimal_comma() -> None:
