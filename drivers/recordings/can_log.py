@@ -17,7 +17,7 @@ from graspd.drivers.can.frames import ERR_FLAG, ERROR, EXTENDED, LOST, REMOTE, C
 from graspd.drivers.can.stream import BoardOptions, CanStream
 from graspd.drivers.link import LinkState
 from graspd.drivers.recordings.can_files import read_asc, read_blf, read_csv, read_trc
-from graspd.drivers.recordings.candump import ANY_BUS, NO_BUS, NS_PER_S, Line, read_candump
+from graspd.drivers.recordings.candump import ANY_BUS, NO_BUS, NS_PER_S, Line, parse, read_candump
 from graspd.drivers.recordings.kinds import (
     HEAD_BYTES,
     LINE_LENGTH_MAX,
@@ -115,6 +115,8 @@ class Survey:
     """The first line that was not understood, with its number; empty: none."""
     frames: Counter[tuple[str, int | None]] = field(default_factory=Counter)
     """Number of frames by bus and arbitration id; id None: CAN FD."""
+    lacks_times: bool = False
+    """True if that line is a frame without a time, as `candump` alone shows it."""
     has_steps: bool = False
     """True if times count from the line before (`candump -td`, ASC with relative times)."""
 
@@ -126,7 +128,9 @@ class Survey:
         survey, last_ns, rises, falls = cls(chain(first, log)), dict[str, int](), 0, 0
         for number, text, logged in first:
             if logged is None:
-                survey.strange = survey.strange or _shown(number, text)
+                if not survey.strange:
+                    survey.strange = _shown(number, text)
+                    survey.lacks_times = parse(f"(0) {text}") is not None
                 continue
             key = logged.bus, None if logged.frame is None else logged.frame.arbitration_id
             is_counted = key in survey.frames or len(survey.frames) < IDS_MAX
@@ -178,7 +182,8 @@ class CanLog(LinkLogDriver[CanFrame]):
         frames: Counter[tuple[str, int | None]] = Counter()
         for path, survey in self._surveys.items():
             if survey.strange and not survey.frames:
-                problem = f"no line was understood: {survey.strange}; record with `candump -L`"
+                why = "the lines have no times" if survey.lacks_times else "no line was understood"
+                problem = f"{why}: {survey.strange}; record with `candump -L`"
                 raise RecordingError(path, problem)
             frames += survey.frames
         self._bus = self._choose({bus for bus, _ in frames})

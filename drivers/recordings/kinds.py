@@ -33,6 +33,8 @@ HEAD_BYTES: Final = 65_536
 """Number of first bytes that decide the kind of a file."""
 HEADER_BYTES: Final = 64
 """Number of first bytes in which zeros show UTF-16 without a byte order mark."""
+METADATA: Final = "metadata.yaml"
+"""File in the folder of a ROS 2 bag."""
 PAGE: Final = "deploy/RECORDING.md"
 
 
@@ -132,8 +134,11 @@ def kind_of(path: Path) -> Kind:
 
     Raises `RecordingError` for what graspd does not read, and for a bag without the extra `bag`.
     """
-    if os.path.isfile(path / "metadata.yaml"):  # also False without the right to look
+    if os.path.isfile(path / METADATA):  # also False without the right to look
         kind = Kind.ROS2_BAG
+    elif os.path.isdir(path):
+        problem = f"is a directory without the file {METADATA}, which a ROS 2 bag has"
+        raise RecordingError(path, f"{problem}: give its .db3 or .mcap, or `ros2 bag reindex` it")
     else:
         with open_recording(path) as file:
             kind = kind_of_open(path, file)
@@ -205,7 +210,10 @@ def _kind_of(head: bytes) -> Kind | None:
         from graspd.drivers.spi.messages import FrameParser
 
         events = (event for event, _ in FrameParser().feed(head))
-        return Kind.SERIAL if not _SERIAL_EVENTS.isdisjoint(events) else None
+        if not _SERIAL_EVENTS.isdisjoint(events):
+            return Kind.SERIAL
+        text = head.rstrip(b"\0")  # a computer that lost power leaves zeros
+        return Kind.TEXT if text and b"\0" not in text else None
     return Kind.TEXT
 
 

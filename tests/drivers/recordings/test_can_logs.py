@@ -154,7 +154,8 @@ def test_lines_that_are_not_understood_are_counted(
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("can0  5A1   [3]  0D 3A 1F\n", r"no line was understood: line 1, 'can0 .*candump -L"),
+        ("can0  5A1   [3]  0D 3A 1F\n", r"the lines have no times: line 1, 'can0 .*candump -L"),
+        ("(1.0) can0  5A1   [1]  10100010\n", r"no line was understood: line 1, .*candump -L"),
         ("(1.0) can0 5A1##00D3A1F\n", "has frames of CAN FD alone"),
     ],
 )

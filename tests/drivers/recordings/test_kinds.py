@@ -59,6 +59,7 @@ FILES: dict[str, tuple[bytes | Callable[[Path], None], Kind]] = {
     "UTF-16": (table(2).decode().encode("utf-16"), Kind.TEXT),
     "Latin-1": (table(2).replace(b"thing", b"K\xe4se"), Kind.TEXT),
     "a line of blanks": (b" " * 65_535 + b"\n", Kind.TEXT),
+    "a table that ends in zeros": (table(2) + bytes(900), Kind.TEXT),
     "Parquet": (parquet, Kind.PARQUET),
     "MCAP of graspd": (mcap(b""), Kind.MCAP),
     "MCAP of ROS 2": (mcap(b"ros2"), Kind.ROS2_BAG),
@@ -109,6 +110,7 @@ OTHERS: dict[str, tuple[bytes | Callable[[Path], None], str]] = {
     "JSON": (b'{"t": 0}\n', "JSON: write the table as CSV"),
     "packed twice": (gzip.compress(gzip.compress(b"1")), "packed twice: unpack it first"),
     "binary": (bytes(range(256)), "is of a kind that is not known"),
+    "zeros": (bytes(256), "is of a kind that is not known"),
 }
 
 
@@ -121,6 +123,11 @@ def test_other_kinds_are_refused_with_a_reason_and_documentation_page(
         kind_of(path)
     assert said in str(caught.value)
     assert str(caught.value).endswith("; deploy/RECORDING.md lists what graspd reads")
+
+
+def test_a_folder_without_metadata_names_the_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"a directory without the file metadata\.yaml"):
+        kind_of(tmp_path)
 
 
 def test_a_long_name_and_an_empty_file_are_errors(tmp_path: Path) -> None:
