@@ -109,6 +109,18 @@ def test_an_overlapping_call_is_refused_and_a_cancelled_one_ends(tmp_path: Path)
         wait_until(lambda: heard.count(b"not-lifting") == 2)
 
 
+def test_a_cancelled_call_that_was_turned_away_ends(tmp_path: Path) -> None:
+    async def cancels() -> None:
+        out = f"ipc://{tmp_path}/out"
+        async with AsyncClient(out, ask_endpoint=out) as graspd:
+            with pytest.raises(asyncio.TimeoutError):
+                await asyncio.wait_for(graspd.may_i_lift(HOURS_S), DEADLINE_S)
+            assert (await graspd.verdict(HOURS_S)).seq is not None
+
+    with false_daemon(tmp_path, outcome="unknown"):
+        asyncio.run(cancels())
+
+
 def test_closing_ends_a_task_that_waits(tmp_path: Path) -> None:
     async def closes() -> None:
         graspd = made(tmp_path)

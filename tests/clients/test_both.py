@@ -97,6 +97,7 @@ def test_only_a_fitting_verdict_and_answer_allow_a_lift(
         ({"still_ms": None}, None, STILL, ["not-still"]),
         (UNKNOWN | {"reasons": ["moving"]}, "ask", {}, ["moving"]),
         (UNKNOWN | {"reasons": ["moving"]}, "nobody", {}, ["moving", "no-answer"]),
+        (UNKNOWN | {"reasons": ["moving"]}, "out", {}, ["moving", "no-answer"]),  # turned away
         (
             UNKNOWN | {"reasons": ["settling", "joints-late"]},
             "ask",

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
+import zmq
 
 from deploy.clients.python import graspd_client
 from deploy.clients.python.graspd_client import Client, Decision, Outcome, Verdict
 from tests.clients.false_daemon import TAKEN
 from tests.clients.messages import MS, TEACHES, frames, verdict
 from tests.clients.world import START_NS, World, client, coming
+from tests.kit.waiting import wait_until
 
 
 def stream(*outcomes: str) -> list[tuple[int, list[bytes]]]:
@@ -224,6 +227,40 @@ def test_a_clock_answer_that_is_not_understood_counts_as_malformed(answer: bytes
     with client(world, ask=True, same=False) as graspd:
         graspd.verdict(0.01)
         assert graspd.counts.malformed == 1
+
+
+def test_a_question_to_a_peer_that_refuses_raises_nothing(tmp_path: Path) -> None:
+    out = f"ipc://{tmp_path}/out"
+    with (
+        zmq.Context() as context,
+        context.socket(zmq.PUB) as refuses,
+        Client(out, ask_endpoint=out) as graspd,
+    ):
+        refuses.bind(out)
+        call = graspd._link.timing  # noqa: SLF001
+
+        def is_turned_away() -> bool:
+            call.ask(b"clock")
+            return call.socket is None
+
+        wait_until(is_turned_away, 0.01)
+        call.ask(b"clock")
+        assert call.socket is not None, "it connects anew"
+
+
+def test_a_call_whose_end_fails_lets_the_next_begin() -> None:
+    def interrupted(timeout_ms: int) -> None:
+        raise KeyboardInterrupt
+
+    def fails(*, lifts: bool = True) -> None:
+        raise zmq.ZMQError(zmq.ETERM, str(lifts))
+
+    world = World([])
+    world.wait, world.asking.hang_up = interrupted, fails  # type: ignore[method-assign]
+    with client(world) as graspd:
+        with pytest.raises(zmq.ZMQError):
+            graspd.may_i_lift(0.3)
+        assert graspd.verdict().reasons == ("no-message",)
 
 
 def test_a_client_without_messages_reconnects_ever_more_seldom() -> None:

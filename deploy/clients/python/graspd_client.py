@@ -24,7 +24,7 @@ import time
 import weakref
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from numbers import Real
@@ -472,10 +472,12 @@ class _Hand:
         try:
             yield
         finally:
-            steps.close()
-            self._turn.release()
-            if self._closed:
-                self._close_if_idle()
+            try:
+                steps.close()
+            finally:
+                self._turn.release()
+                if self._closed:
+                    self._close_if_idle()
 
     def _allow(self, lift: tuple[str, int]) -> None:
         """Note that the hand may lift this grasp (its `_key`); ("", 0): none. The outcome of the
@@ -1110,9 +1112,13 @@ class _Call:
         self.socket: zmq.Socket[bytes] | None = None
 
     def ask(self, question: bytes) -> None:
+        """Send a question, which is lost if the peer has turned this client away."""
         if self.socket is None:
             self.socket = self._link.connected(zmq.DEALER, self._endpoint)
-        self.socket.send(question, zmq.NOBLOCK)
+        try:
+            self.socket.send(question, zmq.NOBLOCK)
+        except zmq.Again:  # a refused handshake ends the connection, and libzmq makes no other
+            self.hang_up()
 
     def answer(self) -> bytes | None:
         """Return the answer; None if none has come yet, b"" if it is not a single frame."""
@@ -1134,7 +1140,8 @@ class _Call:
             leaving.close(0)
         else:
             leaving.linger = TAKE_BACK_MS
-            leaving.send(b"not-lifting", zmq.NOBLOCK)
+            with suppress(zmq.Again):  # turned away: no question has arrived either
+                leaving.send(b"not-lifting", zmq.NOBLOCK)
             self._link.leave(leaving)
 
 
