@@ -7,6 +7,8 @@ import itertools
 import os
 import socket
 
+import pytest
+
 from graspd.biotac import FINGERS
 
 PORTS = (10_000 + (211 * os.getpid() + number) % 20_000 for number in itertools.count())
@@ -20,6 +22,16 @@ def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
         with socket.socket(socket.AF_INET, kind) as probe, contextlib.suppress(OSError):
             probe.bind(("127.0.0.1", port))
             return port
+
+
+def free_ipv6_endpoint() -> str:
+    """Return a TCP endpoint on IPv6's loopback; skip the test where there is none."""
+    with socket.socket(socket.AF_INET6) as probe:
+        try:
+            probe.bind(("::1", 0))
+        except OSError:
+            pytest.skip("this computer has no IPv6")
+    return f"tcp://[::1]:{free_port()}"
 
 
 def multicast_group() -> str:

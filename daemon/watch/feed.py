@@ -85,6 +85,7 @@ class Feed:
             self._socket.curve_publickey, self._socket.curve_secretkey = self._keys[:2]
             self._socket.curve_serverkey = self._keys[2]
         if self._endpoint.startswith("tcp://"):
+            self._socket.ipv6 = "[" in self._endpoint
             self._socket.heartbeat_ivl = HEARTBEAT_MS
             self._socket.heartbeat_timeout = HEARTBEAT_TIMEOUT_MS
         self._monitor = self._socket.get_monitor_socket(sum(EVENTS))

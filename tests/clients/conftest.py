@@ -50,8 +50,8 @@ def connect(request: pytest.FixtureRequest) -> Iterator[Connect]:
     closed afterwards."""
     with ExitStack() as stack:
 
-        def made(folder: Path, ask: str | None = "ask") -> Either:
-            out, asked = f"ipc://{folder}/out", ask and f"ipc://{folder}/{ask}"
+        def made(folder: Path, ask: str | None = "ask", out: str | None = None) -> Either:
+            out, asked = out or f"ipc://{folder}/out", ask and f"ipc://{folder}/{ask}"
             if request.param == "cpp":
                 return InCpp(request.getfixturevalue("probe"), out, asked)
             return InPython(stack.enter_context(Client(out, ask_endpoint=asked)))

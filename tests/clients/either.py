@@ -104,4 +104,5 @@ class InCpp:
 
 Either = InPython | InCpp
 Connect = Callable[..., Either]
-"""Makes a client of the sockets `out` and `ask` (None: without) in a folder."""
+"""Makes a client of the sockets `out` and `ask` (None: without) in a folder, or of an endpoint as
+`out`."""

@@ -42,20 +42,23 @@ def false_daemon(
     answer: Answer | None = None,
     outcome: str = "stable",
     taken: Sequence[bytes] = (TAKEN,),
+    endpoint: str | None = None,
     **more: object,
 ) -> Iterator[list[bytes]]:
     """Publish verdicts of `outcome`, with fields `more`, during the block, and answer `lift`.
 
     `messages_each` in `more`: messages on each grasp, else all are on one. `answer` None: with what
-    was published. Frames `taken` answer an outcome. Yields the list of questions and outcomes
-    received so far.
+    was published. Frames `taken` answer an outcome. `endpoint`: where to publish; None: at `out` in
+    `folder`. Yields the list of questions and outcomes received so far.
     """
     heard: list[bytes] = []
-    with at_work(partial(_serve, folder, answer or told(), outcome, taken, more, heard)):
+    out = endpoint or f"ipc://{folder}/out"
+    with at_work(partial(_serve, out, folder, answer or told(), outcome, taken, more, heard)):
         yield heard
 
 
 def _serve(
+    endpoint: str,
     folder: Path,
     answer: Answer,
     outcome: str,
@@ -70,7 +73,8 @@ def _serve(
         context.socket(zmq.ROUTER) as questions,
     ):
         out.linger = questions.linger = 0
-        out.bind(f"ipc://{folder}/out")
+        out.ipv6 = "[" in endpoint
+        out.bind(endpoint)
         questions.bind(f"ipc://{folder}/ask")
         seq = 0
         while not stop.is_set():

@@ -11,6 +11,7 @@ from tests.clients.either import Connect
 from tests.clients.false_daemon import Answer, false_daemon, of, told
 from tests.clients.messages import TEACHES
 from tests.kit.waiting import wait_until
+from tests.ports import free_ipv6_endpoint
 
 LONG_S, DEADLINE_S = 100.0, 0.3
 """Deadlines of a lift that is allowed in the end, and of one that never is, s."""
@@ -118,6 +119,12 @@ def test_a_refused_lift_has_its_reasons(
     with false_daemon(tmp_path, **published):
         graspd = connect(tmp_path, ask)
         wait_until(lambda: graspd.lift(DEADLINE_S, **wants).reasons == tuple(reasons))
+
+
+def test_clients_reach_a_daemon_on_an_ipv6_address(connect: Connect, tmp_path: Path) -> None:
+    endpoint = free_ipv6_endpoint()
+    with false_daemon(tmp_path, endpoint=endpoint):
+        assert connect(tmp_path, out=endpoint).lift(LONG_S).may
 
 
 @pytest.mark.parametrize("still_ms", [-1.0, float("nan"), float("inf")])

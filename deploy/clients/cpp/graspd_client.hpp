@@ -777,6 +777,7 @@ private:
             set(zmq::sockopt::curve_secretkey, options_.keys->secret_key);
         }
         if (endpoint.rfind("tcp://", 0) == 0) {
+            set(zmq::sockopt::ipv6, endpoint.find('[') != std::string::npos);
             set(zmq::sockopt::heartbeat_ivl, HEARTBEAT_MS);
             set(zmq::sockopt::heartbeat_timeout, HEARTBEAT_TIMEOUT_MS);
         }

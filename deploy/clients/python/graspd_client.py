@@ -1088,6 +1088,7 @@ class _Link:
         if self._keys is not None:
             made.curve_serverkey, made.curve_publickey, made.curve_secretkey = self._keys
         if endpoint.startswith("tcp://"):
+            made.ipv6 = "[" in endpoint
             made.heartbeat_ivl, made.heartbeat_timeout = HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS
         if kind == zmq.SUB:
             made.subscribe(self._topic)

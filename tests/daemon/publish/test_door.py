@@ -32,7 +32,7 @@ from tests.daemon.publish.doors import (
     receive,
 )
 from tests.kit.waiting import wait_until
-from tests.ports import free_port
+from tests.ports import free_ipv6_endpoint, free_port
 
 SCHEMES = ("ipc", "tcp", "ip6")
 ME = b"user %d" % os.getuid()
@@ -49,24 +49,13 @@ def endpoint_of(scheme: str, folder: Path) -> str:
     """Return a free endpoint of a scheme, one of `SCHEMES`."""
     if scheme == "ipc":
         return f"ipc://{folder}/v"
-    return f"tcp://{'[::1]' if scheme == 'ip6' else '127.0.0.1'}:{free_port()}"
-
-
-def has_ipv6() -> bool:
-    with socket.socket(socket.AF_INET6) as probe:
-        try:
-            probe.bind(("::1", 0))
-        except OSError:
-            return False
-    return True
+    return free_ipv6_endpoint() if scheme == "ip6" else f"tcp://127.0.0.1:{free_port()}"
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_a_subscriber_gets_messages_of_two_frames_in_order(
     tmp_path: Path, peers: Peers, scheme: str
 ) -> None:
-    if scheme == "ip6" and not has_ipv6():
-        pytest.skip("this computer has no IPv6")
     endpoint = endpoint_of(scheme, tmp_path)
     with Publisher(endpoint) as publisher:
         subscriber = peers.subscribe(endpoint, "verdict.")

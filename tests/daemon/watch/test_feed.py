@@ -18,6 +18,7 @@ from tests.daemon.publish.doors import Asked, KeyedDoor, Peers, Publisher, first
 from tests.daemon.watch.watch_fakes import MS, verdict
 from tests.kit.messages import decode_verdict
 from tests.kit.waiting import wait_until
+from tests.ports import free_ipv6_endpoint
 
 Keys = tuple[bytes, bytes, bytes]
 
@@ -78,6 +79,13 @@ def test_an_unread_messages_age_counts_from_the_last_empty_queue(endpoint: str) 
         wait_until(has_come, 0.01)
     assert view.snapshot(clock.now_ns).headline == "unknown"
     assert view.snapshot(clock.now_ns - 900 * MS).headline == "stable"
+
+
+def test_a_viewer_reaches_a_daemon_on_an_ipv6_address() -> None:
+    endpoint = free_ipv6_endpoint()
+    with Publisher(endpoint) as publisher, Feed(endpoint) as feed:
+        (message, *_) = first_of(publisher, feed, 0, Decision.STABLE)
+    assert decode_verdict(message).verdict == "stable"
 
 
 @pytest.fixture
