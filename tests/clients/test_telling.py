@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import re
+import subprocess
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,10 +15,12 @@ import pytest
 from deploy.clients.python.graspd_client import Client, Decision, Outcome, Verdict
 from tests.clients.either import Connect, Grasp
 from tests.clients.false_daemon import TAKEN, false_daemon
-from tests.clients.messages import verdict
+from tests.clients.messages import TEACHES, verdict
 from tests.clients.test_both import DEADLINE_S, LONG_S
+from tests.conftest import ROOT
 from tests.kit.waiting import wait_until
 
+PYTHON = ROOT / "deploy" / "clients" / "python"
 LIFTED_ON = Grasp("0f0e0d0c0b0a09080706050403020100", 42)
 ANSWERS: dict[str, tuple[list[bytes], str]] = {
     "taken": ([TAKEN], ""),
@@ -115,3 +121,23 @@ def test_lifts_without_an_outcome_are_counted_and_warned_of(
     assert caplog.messages + graspd.warned == [
         f"{number} lifts were allowed, and their outcome not told" for number in (1, 11)
     ]
+
+
+def test_the_example_controller_reports_a_supervised_unknown_grasp(tmp_path: Path) -> None:
+    code = (PYTHON / "try_outcomes.py").read_text()
+    for place, name in (("/tmp/graspd-loop.ask.ipc", "ask"), ("/tmp/graspd-loop.ipc", "out")):
+        code = code.replace(f"ipc://{place}", f"ipc://{tmp_path}/{name}")
+    with false_daemon(tmp_path, outcome="unknown", messages_each=100, **TEACHES) as heard:
+        controller = subprocess.run(
+            [sys.executable, "-c", code],
+            env={**os.environ, "PYTHONPATH": str(PYTHON)},
+            input="h\n",  # and then the input ends
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+    assert (controller.returncode, controller.stderr) == (0, "")
+    assert re.search(r"^grasp \d+: unknown, p_slip not known Risk\(", controller.stdout)
+    told = [each.split()[3:] for each in heard if each.startswith(b"outcome ")]
+    assert told == [[b"stable", b"mug"], [b"not-lifted", b"mug"]]

@@ -35,10 +35,11 @@ def main() -> None:
     with Client(VERDICTS, ask_endpoint=QUESTIONS) as client:
         while True:
             answer = client.may_i_lift(10.0, supervised=True)
-            verdict = answer.verdict
-            if not answer or verdict.p_slip is None:
+            if not answer:
                 continue
-            said = f"{verdict.decision}, p_slip {verdict.p_slip:.2f} {verdict.risk}"
+            verdict = answer.verdict
+            p_slip = "not known" if verdict.p_slip is None else f"{verdict.p_slip:.2f}"
+            said = f"{verdict.decision}, p_slip {p_slip} {verdict.risk}"
             sys.stdout.write(f"grasp {verdict.grasp}: {said}\n")
             sys.stdout.write(f"{verdict.outcomes} outcomes told. ")
             outcome = asked()
