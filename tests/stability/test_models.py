@@ -29,11 +29,7 @@ from graspd.models.training.reports.stability.chain import (
     Comparison,
 )
 from graspd.models.training.reports.stability.exact import Reference, exact_input
-from graspd.models.training.reports.stability.readings import (
-    RANDOM,
-    READINGS,
-    Raw,
-)
+from graspd.models.training.reports.stability.readings import RANDOM, READINGS, Raw
 from graspd.models.training.reports.stability.row import Row
 from tests.kit.inside import graspd
 

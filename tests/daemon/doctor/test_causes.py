@@ -26,15 +26,7 @@ from graspd.daemon.doctor.surroundings import can_finding
 from graspd.drivers.datagrams.tactile import TactileStreamDriver
 from graspd.drivers.twins import spi as spi_twin
 from graspd.drivers.twins.grasps.whole_grasps import synthetic_grasps
-from tests.daemon.doctor.emulated import (
-    CAN,
-    FINGERS,
-    SPI,
-    asked,
-    look,
-    refused,
-    scene_of,
-)
+from tests.daemon.doctor.emulated import CAN, FINGERS, SPI, asked, look, refused, scene_of
 from tests.daemon.processes import start
 from tests.drivers.can.can_standin import LOOPBACK, SocketBus, sweep_of_frames
 from tests.kit.clock import Clock

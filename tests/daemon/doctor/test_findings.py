@@ -188,9 +188,7 @@ def test_a_device_fact_gets_level_cause_and_advice_by_fault(
 
 
 @pytest.mark.parametrize("cause", LinkCause)
-def test_each_link_fault_is_an_error_with_cause_and_advice(
-    cause: LinkCause,
-) -> None:
+def test_each_link_fault_is_an_error_with_cause_and_advice(cause: LinkCause) -> None:
     """test_link_faults and test_causes check which cause it is."""
     told = set()
     for why in ("no answer from /dev/x", "something new"):

@@ -21,9 +21,7 @@ def worker() -> Iterator[Worker[object]]:
     made.close(PATIENCE_S)
 
 
-def test_a_job_wakes_the_loop_and_gives_one_result(
-    worker: Worker[object],
-) -> None:
+def test_a_job_wakes_the_loop_and_gives_one_result(worker: Worker[object]) -> None:
     assert worker.filenos == []
     assert worker.submit(lambda: 7)
     readable, _, _ = select.select(worker.filenos, [], [], PATIENCE_S)
@@ -60,9 +58,7 @@ def test_where_the_system_refuses_a_thread_a_job_is_refused(
     assert worker.take(PATIENCE_S) == 1
 
 
-def test_a_job_has_no_realtime_priority_or_processors(
-    worker: Worker[object],
-) -> None:
+def test_a_job_has_no_realtime_priority_or_processors(worker: Worker[object]) -> None:
     processors = os.sched_getaffinity(0)
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))

@@ -137,9 +137,7 @@ def test_a_key_that_others_may_write_is_refused(tmp_path: Path, mode: int) -> No
         load_own(secret)
 
 
-def test_keys_below_a_shared_folder_need_its_sticky_bit(
-    tmp_path: Path,
-) -> None:
+def test_keys_below_a_shared_folder_need_its_sticky_bit(tmp_path: Path) -> None:
     """A sticky folder, such as /tmp, lets no user replace another's files."""
     keys = tmp_path / "keys"
     public, secret = make(keys, "laptop")

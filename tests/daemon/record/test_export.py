@@ -90,9 +90,7 @@ def record(path: Path, *grasps: tuple[NDArray[np.integer[Any]], Ending, str | No
     writer.close()
 
 
-def test_only_judgements_of_sound_readings_have_judged_counts(
-    tmp_path: Path,
-) -> None:
+def test_only_judgements_of_sound_readings_have_judged_counts(tmp_path: Path) -> None:
     wanted = scene.load(demo_scene(tmp_path, sections='[model]\nname = "cnn1"'))
     pipeline = assembly.build_pipeline(Plan.of(wanted), assembly.load_model(wanted), lambda: 10**12)
     counts, sound = read_table(DEMO_TABLE).counts[0], np.zeros((3, 24), dtype=np.uint8)
@@ -137,9 +135,7 @@ def test_of_grasps_with_the_same_counts_the_first_is_kept(tmp_path: Path) -> Non
     assert len(read_table(tmp_path / "a.csv").slipped) == 2
 
 
-def test_an_exported_grasp_without_object_gets_that_of_the_option(
-    tmp_path: Path,
-) -> None:
+def test_an_exported_grasp_without_object_gets_that_of_the_option(tmp_path: Path) -> None:
     writer = Writer(tmp_path / "a.mcap")
     for grasp, counts in enumerate(sweeps(6), 1):
         writer.judged(grasp, counts)

@@ -23,12 +23,7 @@ from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.recordings import RecordedRun
 from graspd.daemon.publish.messages import encode
 from graspd.models.training.data.datasets import read_table
-from tests.daemon.record.recorded import (
-    compared,
-    files,
-    messages,
-    without_null,
-)
+from tests.daemon.record.recorded import compared, files, messages, without_null
 from tests.kit.inside import graspd
 from tests.process_replay.judging import Case, run
 from tests.process_replay.streams import demo

@@ -139,9 +139,7 @@ def test_an_overloaded_loop_sleeps_feeds_the_watchdog_and_reports() -> None:
     assert max(np.diff([status.t_mono_ns for status in bench.statuses])) < 1.1 * SECOND_NS
 
 
-def test_an_overload_is_logged_at_its_begin_and_end(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_an_overload_is_logged_at_its_begin_and_end(caplog: pytest.LogCaptureFixture) -> None:
     clock = Clock()
 
     def cost_ns() -> int:

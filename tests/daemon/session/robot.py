@@ -20,11 +20,7 @@ from graspd.models import zoo
 from graspd.models.judge.session import SessionCalibration
 from graspd.models.runtime import TactileModel
 from tests.daemon.fakes import FINGERS, MS, Clock
-from tests.daemon.session.learning import (
-    NOBODY,
-    SHORT,
-    sensors,
-)
+from tests.daemon.session.learning import NOBODY, SHORT, sensors
 
 OUTAGE_NS = 2_000_000_000
 """Duration of an outage, ns: longer than the second after which tares are forgotten."""

@@ -23,15 +23,7 @@ from graspd.daemon.session.folder import SessionFolder
 from graspd.daemon.trust.trust import Trust
 from graspd.models.session_statistics import SessionState
 from graspd.models.trust.risk import RiskLimits
-from tests.daemon.session.learning import (
-    FINGERS,
-    INPUTS,
-    judge,
-    kept_in,
-    sealed,
-    tell,
-    trust,
-)
+from tests.daemon.session.learning import FINGERS, INPUTS, judge, kept_in, sealed, tell, trust
 
 STEPS = ("open", "chmod", "fsync", "replace", "unlink")
 """Functions of `os` by which a file is written; a kill comes before or after a call of one."""

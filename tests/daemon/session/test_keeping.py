@@ -14,13 +14,7 @@ from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.publish.companion import KEPT, Reply, Told
 from graspd.daemon.session.file import KeptSession
 from graspd.daemon.session.folder import SessionFolder
-from graspd.daemon.session.keeper import (
-    BUSY,
-    HANGS,
-    WAIT_S,
-    WAITING_MAX,
-    SessionKeeper,
-)
+from graspd.daemon.session.keeper import BUSY, HANGS, WAIT_S, WAITING_MAX, SessionKeeper
 from graspd.daemon.session.sensors import LOOK_EVERY
 from graspd.daemon.trust.lift_book import OutcomeStatus
 from graspd.daemon.trust.trust import Trust

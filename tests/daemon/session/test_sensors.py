@@ -45,9 +45,7 @@ from tests.daemon.session.learning import (
 from tests.daemon.session.robot import Day, Robot
 
 
-def test_each_change_of_a_serial_number_is_reported_once(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_each_change_of_a_serial_number_is_reported_once(caplog: pytest.LogCaptureFixture) -> None:
     driver, exchanges = sensors(), []
     watch = sensor_watch(driver, lambda: exchanges.append(dict(driver.known)))
     steps: list[dict[str, str]] = [

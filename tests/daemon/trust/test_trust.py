@@ -26,9 +26,7 @@ def p_slip(part: Trust, grasp: int = 0, margin: float = -1.0) -> float:
 
 
 @pytest.mark.parametrize("limits", [RiskLimits(), RULE])
-def test_without_outcomes_the_models_probability_is_unchanged(
-    limits: RiskLimits,
-) -> None:
+def test_without_outcomes_the_models_probability_is_unchanged(limits: RiskLimits) -> None:
     part = trust(limits)
     for grasp, p in enumerate((0.0, 1e-300, 0.1, 0.1 + 1e-17, 0.5, 1.0 - 2**-53, 1.0)):
         found = part.judge(named(grasp), p, 0.3, inputs(grasp))

@@ -10,14 +10,7 @@ from graspd.daemon.commands.watch import where_to_look
 from graspd.daemon.judge.reasons import ADVICE, Decision, Need, Reason
 from graspd.daemon.watch.snapshot import Line, Link, Tone
 from graspd.daemon.watch.view import View
-from tests.daemon.watch.watch_fakes import (
-    ENDPOINT,
-    MS,
-    a_view,
-    after,
-    status,
-    verdict,
-)
+from tests.daemon.watch.watch_fakes import ENDPOINT, MS, a_view, after, status, verdict
 
 
 @pytest.mark.parametrize(
