@@ -37,6 +37,7 @@ COMMANDS: Final[Mapping[str, str]] = {
     "help": "--help",
     "version": "--version",
     "option-first": "--json check demo.toml",
+    "mistyped": "--verison",
     "wrong-option": "check demo.toml --jsn",
     "run": "run demo.toml",
     "run-absent": "run absent.toml",
@@ -62,6 +63,17 @@ COMMANDS: Final[Mapping[str, str]] = {
     "replay-warm-up": "replay table.csv --warm-up 3",
     "replay-scene": "replay table.csv --scene demo.toml",
     "replay-session-absent": "replay table.csv --session absent.json",
+    "replay-speed": "replay --speed nan",
+    "replay-publish": "replay --publish tcp://1.2.3.4:5",
+    "replay-publish-any-path": "replay --publish ipc://*",
+    "replay-publish-any-port": "replay --publish tcp://127.0.0.1:*",
+    "replay-nobody": "replay --publish ipc://nobody --wait 0.1",
+    "replay-warm-up-below-0": "replay --max-slip-when-stable 0.1 --warm-up -1",
+    "replay-risk-untold": "replay table.csv --max-slip-when-stable 0.1",
+    "replay-mixed": "replay table.csv stream.csv",
+    "replay-every": "replay recorded.mcap --gate every",
+    "replay-mistyped": "replay --max-slip-when-stabel=0.1",
+    "replay-mistyped-gate": "replay --gate setled",
     "check": "check demo.toml can.toml palm.toml spi.toml two-fingers.toml",
     "check-json": "check demo.toml --json",
     "check-all-wrong": "check wrong.toml absent.toml",
@@ -70,12 +82,16 @@ COMMANDS: Final[Mapping[str, str]] = {
     "models-card": "models small-session",
     "models-json": "models small-session --json",
     "models-unknown": "models cnn2",
+    "models-mistyped": "models smal-session",
+    "train-mistyped": "train smal-session",
     "models-no-file": "models absent.onnx",
     "session-seed": "session seed kept.toml table.csv",
     "session-show": "session show kept.toml",
     "replay-session": "replay day.csv --session session/1.session --verbose",
     "session-reset": "session reset kept.toml",
     "session-none": "session show kept.toml",
+    "session-no-model": "session show cnn1.toml",
+    "session-mistyped": "session shwo kept.toml",
     "keys-make": "keys make arm --dir keys",
     "keys-make-again": "keys make arm --dir keys",
     "keys-list": "keys list --dir keys",
@@ -90,7 +106,18 @@ COMMANDS: Final[Mapping[str, str]] = {
     "manual": "manual",
     "report-unknown": "report accuracy",
     "watch-wrong-port": "watch --port 0",
+    "watch-no-terminal": "watch --connect ipc:///tmp/x",
+    "watch-wrong-endpoint": "watch --connect nonsense",
+    "watch-no-server-key": "watch --connect tcp://127.0.0.1:1 --keys x",
+    "watch-web-wrong-port": "watch --connect ipc:///tmp/x --port 0 --web",
+    "watch-both": "watch --connect ipc:///tmp/x demo.toml",
+    "watch-absent": "watch absent.toml",
+    "watch-nine": "watch" + 9 * " --connect ipc:///tmp/x",
     "twin-unknown": "twin hand",
+    "twin-drop": "twin spi --drop 2",
+    "twin-dead": "twin spi --dead th",
+    "twin-mistyped": "twin spi --stuk-clock",
+    "twin-other-fault": "twin palm --one-byte-at-a-time",
     **{
         f"help-{words.replace(' ', '-')}": f"{words} --help"
         for words in (
@@ -114,6 +141,7 @@ SCENES: Final[Mapping[str, str]] = {
     "not-there": DEMO_SCENE.replace("stream.csv", "absent.csv"),
     "fingers": DEMO_SCENE + '[hand]\nfingers = ["th", "mf", "ff"]\n',
     "no-folder": DEMO_SCENE.replace("/graspd", "/absent/graspd"),
+    "cnn1": DEMO_SCENE + '[model]\nname = "cnn1"\n[learn]\nenabled = false\n',
     "kept": DEMO_SCENE + '[session]\nkeep = true\nfolder = "session"\n',
 }
 
@@ -145,6 +173,7 @@ def execute(arguments: Sequence[str], folder: Path) -> CompletedProcess[str]:
     with contextlib.chdir(folder), pytest.MonkeyPatch.context() as patched:
         patched.setenv("COLUMNS", "80")
         patched.setenv("HOME", str(folder))
+        patched.setattr("os.nice", lambda _more: 0)
         return graspd(*arguments)
 
 

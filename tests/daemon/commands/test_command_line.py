@@ -88,25 +88,6 @@ def test_every_argument_of_every_command_has_help() -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "meant"),
-    [
-        (["--verison"], "--version"),
-        (["session", "shwo", "scene.toml"], "show"),
-        (["twin", "spi", "--stuk-clock"], "--stuck-clock"),
-        (["replay", "--max-slip-when-stabel=0.1"], "--max-slip-when-stable"),
-        (["replay", "--gate", "setled"], "settled"),
-        (["models", "smal-session"], "small-session"),
-        (["train", "smal-session"], "small-session"),
-    ],
-    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
-)
-def test_a_mistyped_word_is_refused_with_the_nearest_one(arguments: list[str], meant: str) -> None:
-    done = graspd(*arguments)
-    assert done.returncode == 2
-    assert done.stderr.endswith(f"; did you mean {meant}?\n")
-
-
-@pytest.mark.parametrize(
     ("files_first", "mixed"),
     [
         ("replay A B --json --scene X", "replay A --json --scene X B"),

@@ -12,35 +12,13 @@ from pathlib import Path
 
 import pytest
 
-from graspd.drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
+from graspd.drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.processes import TIMEOUT_S, start
 from tests.kit.inside import graspd
 from tests.kit.programs import ran
 from tests.kit.scenes import written
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (["replay", "--speed", "nan"], "nan is not a number from 0.001 to 1e+06"),
-        (["replay", "--publish", "tcp://1.2.3.4:5"], "not a loopback address"),
-        (["replay", "--publish", "ipc://*"], "needs a path that subscribers can know"),
-        (["replay", "--publish", "tcp://127.0.0.1:*"], "needs a port"),
-        (["replay", "--max-slip-when-stable", "0.1", "--warm-up", "-1"], "risk.warm_up"),
-        (["replay", str(DEMO_TABLE), "--max-slip-when-stable", "0.1"], "it needs --outcomes"),
-        (["replay", str(DEMO_TABLE), str(DEMO_RECORDING)], "both grasp tables and streams"),
-        (["twin", "spi", "--drop", "2"], "drop_probability is 2.0, must be in 0..1"),
-        (["twin", "spi", "--dead", "th"], "'th' is not an electrode"),
-        (["twin", "palm", "--one-byte-at-a-time"], "cannot show the fault one-byte-at-a-time"),
-    ],
-)
-def test_a_wrong_command_line_is_exit_code_2(arguments: list[str], says: str) -> None:
-    result = graspd(*arguments)
-    assert result.returncode == 2
-    assert says in result.stderr
-    assert "Traceback" not in result.stderr
 
 
 PALM = '[tactile]\ndriver = "palm"\n'

@@ -194,12 +194,6 @@ def test_a_subscriber_in_another_process_gets_every_paced_verdict(
     assert list(tmp_path.iterdir()) == [received]
 
 
-def test_replay_with_wait_fails_without_a_subscriber(tmp_path: Path) -> None:
-    result = graspd("replay", "--publish", f"ipc://{tmp_path}/graspd", "--wait", 0.1)
-    assert result.returncode == 1
-    assert result.stderr.startswith("graspd: no subscriber of ipc://")
-
-
 @pytest.mark.parametrize(
     ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)], ids=["INT", "TERM"]
 )

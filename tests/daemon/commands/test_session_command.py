@@ -92,10 +92,3 @@ def test_replay_refuses_a_session_of_other_size_in_one_line(tmp_path: Path) -> N
     result = graspd("replay", "--session", tmp_path / "1.session")
     assert result.returncode == 2
     assert result.stderr == "graspd: the kept session is of 10 values, not of 150\n"
-
-
-def test_session_show_refuses_a_model_that_keeps_no_session(tmp_path: Path) -> None:
-    path = session_scene(tmp_path, "cnn1", "[learn]\nenabled = false\n")
-    result = graspd("session", "show", path)
-    assert result.returncode == 2
-    assert result.stderr == "graspd: the model cnn1 keeps no session\n"

@@ -188,12 +188,6 @@ def test_the_summary_of_a_replay_counts_recorded_outcomes(rotated: Lab) -> None:
     assert graspd("replay", "--outcomes", *rotated.files).returncode == 2
 
 
-def test_replaying_a_recording_with_gate_every_is_refused(rotated: Lab) -> None:
-    result = graspd("replay", *rotated.files, "--gate", "every")
-    assert (result.returncode, result.stdout) == (2, "")
-    assert "gate mode `every` judges each row of a grasp table" in result.stderr
-
-
 def test_a_warning_names_a_file_after_a_gap(rotated: Lab, caplog: pytest.LogCaptureFixture) -> None:
     first, second, third = rotated.files[:3]
     recorded = RecordedRun([first, second, third])

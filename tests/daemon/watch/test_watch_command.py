@@ -21,7 +21,6 @@ import pytest
 from graspd.daemon.judge.reasons import Decision
 from tests.daemon.processes import GRASPD, start
 from tests.daemon.watch.watch_fakes import Talker
-from tests.kit.inside import graspd
 from tests.kit.waiting import PATIENCE_S, wait_until
 from tests.ports import free_port
 
@@ -156,24 +155,3 @@ def test_several_scenes_are_one_page_of_one_process(tmp_path: Path, port: int) -
         assert (second["hand"], second["endpoint"]) == ("right", f"ipc://{tmp_path}/right")
         assert page.stderr is not None
         assert page.stderr.read() == ""
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["--connect", "ipc:///tmp/x"], "watch draws on a terminal"),
-        (["--connect", "nonsense"], "nonsense: cannot connect there"),
-        (["--connect", "tcp://127.0.0.1:1", "--keys", "x"], "--keys needs --server-key"),
-        (["--connect", "ipc:///tmp/x", "--port", "0", "--web"], "not a port of 1 to 65535"),
-        (["--connect", "ipc:///tmp/x", "scene.toml"], "give one or the other"),
-        (["no-such-scene.toml"], "cannot read the scene"),
-        (["--connect", "ipc:///tmp/x"] * 9, "9 hands are more than the 8 that can be watched"),
-    ],
-)
-def test_wrong_arguments_are_refused_with_a_message(
-    arguments: list[str], said: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(os, "nice", lambda _more: 0)
-    result = graspd("watch", *arguments)
-    assert result.returncode == 2
-    assert said in result.stderr
