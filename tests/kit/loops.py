@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import selectors
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing, nullcontext
 
 from graspd.daemon.judge.decision import HandLimits
@@ -14,7 +14,7 @@ from graspd.daemon.publish.messages import Status, Verdict
 from graspd.daemon.publish.outbox import Outbox
 from graspd.daemon.run.loop import Ended, Loop, LoopTiming
 from graspd.daemon.trust.trust import Trust
-from graspd.drivers.base import TactileReading
+from graspd.drivers.base import Reading, TactileReading
 from tests.daemon.fakes import FINGERS, MS, Clock, FakeDriver, FakeModel, pipeline
 from tests.kit.messages import decode_status
 
@@ -50,6 +50,41 @@ class ClockSelector(selectors.SelectSelector):
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         self.clock.now_ns += round((timeout or 0.0) * 1e9)
         return []
+
+
+class TimedDriver(FakeDriver):
+    """Driver that hands over the readings due by its clock, at most `at_once` per call."""
+
+    def __init__(
+        self,
+        readings: Iterable[Reading],
+        clock: Clock,
+        *,
+        live: bool = True,
+        at_once: int = 1000,
+    ) -> None:
+        super().__init__([], clock)
+        self.live = live
+        self.at_once = at_once
+        self.calls = 0
+        self._readings = iter(readings)
+        self._next = next(self._readings, None)
+
+    @property
+    def exhausted(self) -> bool:
+        return self._next is None
+
+    def due_ns(self) -> int | None:
+        return None if self._next is None else self._next.t_ns
+
+    def read_ready(self) -> Sequence[Reading]:
+        self.calls += 1
+        ready: list[Reading] = []
+        while self._next and self._next.t_ns <= self.clock() and len(ready) < self.at_once:
+            ready.append(self._next)
+            self.counters.readings += isinstance(self._next, TactileReading)
+            self._next = next(self._readings, None)
+        return ready
 
 
 class LoopBench(Companion):

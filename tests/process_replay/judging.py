@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field
 from itertools import islice
@@ -24,10 +24,9 @@ from graspd.daemon.run.loop import Loop, LoopTiming
 from graspd.daemon.scene import Scene
 from graspd.daemon.scene.scene import Record
 from graspd.daemon.trust.lift_book import GraspId, Report
-from graspd.drivers.base import Reading, TactileReading
-from tests.daemon.fakes import FakeDriver
+from graspd.drivers.base import Reading
 from tests.kit.clock import Clock
-from tests.kit.loops import ClockSelector
+from tests.kit.loops import ClockSelector, TimedDriver
 from tests.process_replay.streams import FINGERS, START_NS
 
 BOOT_ID: Final = "0123456789abcdef" * 2
@@ -85,7 +84,8 @@ def run(case: Case, record_in: Path | None = None) -> list[Message]:
         lambda: clock() / 1e9,
         boot_id=BOOT_ID,
     )
-    driver = _Driver(islice(case.readings(), case.readings_max), clock, live=case.slow)
+    driver = TimedDriver(islice(case.readings(), case.readings_max), clock, live=case.slow)
+    driver.name = "stream"
     timing = LoopTiming(
         wanted.max_age_ns,
         clock,
@@ -124,33 +124,6 @@ def _scene(case: Case) -> Scene:
     if case.joints:
         sections["joints"] = {"driver": "stream", "source": "udp://127.0.0.1:9871"}
     return scene.parse({**sections, **case.sections}, Path("process replay"))
-
-
-class _Driver(FakeDriver):
-    """Driver that hands over all readings that are due by the simulated clock."""
-
-    name = "stream"
-
-    def __init__(self, readings: Iterator[Reading], clock: Clock, *, live: bool) -> None:
-        super().__init__([], clock)
-        self.live = live
-        self._readings = readings
-        self._next = next(readings, None)
-
-    @property
-    def exhausted(self) -> bool:
-        return self._next is None
-
-    def due_ns(self) -> int | None:
-        return None if self._next is None else self._next.t_ns
-
-    def read_ready(self) -> Sequence[Reading]:
-        ready: list[Reading] = []
-        while self._next is not None and self._next.t_ns <= self.clock():
-            ready.append(self._next)
-            self.counters.readings += isinstance(self._next, TactileReading)
-            self._next = next(self._readings, None)
-        return ready
 
 
 class _World(Companion):

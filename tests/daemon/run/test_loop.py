@@ -31,11 +31,10 @@ from graspd.drivers.base import (
     LinkCause,
     LinkError,
     Reading,
-    TactileReading,
 )
 from tests.daemon.fakes import FINGERS, MS, Clock, FakeDriver, FakeModel, reading
 from tests.daemon.session.learning import sensor_watch
-from tests.kit.loops import LoopBench
+from tests.kit.loops import LoopBench, TimedDriver
 from tests.kit.messages import decode_tactile
 
 
@@ -54,58 +53,32 @@ def test_every_reading_gets_one_verdict_in_order() -> None:
     assert sent == bench.payloads
 
 
-class ScriptedDriver(FakeDriver):
-    """Driver that moves the clock by 1 ms at each read, and has a reading at each of `times_ms`."""
-
-    def __init__(self, times_ms: list[int], clock: Clock, end_ms: int) -> None:
-        super().__init__([], clock)
-        self.start_ns = clock()
-        self.times_ns = [self.start_ns + time * MS for time in times_ms]
-        self.end_ns = self.start_ns + end_ms * MS
-
-    @property
-    def exhausted(self) -> bool:
-        return self.clock() >= self.end_ns
-
-    def due_ns(self) -> int | None:
-        return self.clock()
-
-    def read_ready(self) -> list[TactileReading]:
-        self.clock.now_ns += MS
-        if self.times_ns and self.clock() >= self.times_ns[0]:
-            del self.times_ns[0]
-            return [reading(self.clock(), self.clock() // MS % 1000)]
-        return []
-
-
-def test_silence_is_reported_once_per_age_limit() -> None:
+@pytest.mark.parametrize(
+    ("period_ms", "limit_ms", "expected"),
+    [
+        (10, 100.0, [(10, 0), (10, 100), (10, 200), (10, 300), (400, 0)]),
+        (50, 500.0, [(10, 0), (400, 0), (400, 500), (950, 0)]),
+    ],
+)
+def test_silence_is_reported_once_per_age_limit_or_ten_periods(
+    period_ms: int, limit_ms: float, expected: list[tuple[int, int]]
+) -> None:
+    """`expected`: of each verdict the time of its reading, ms, and the reading's age, ms."""
     clock = Clock()
     start_ns = clock()
-    bench = LoopBench(ScriptedDriver([10, 400], clock, 450), clock)
+    times_ms = [time_ms for time_ms, age_ms in expected if age_ms == 0]
+    driver = TimedDriver([reading(start_ns + time * MS, time) for time in times_ms], clock)
+    driver.period_ns = period_ms * MS
+    bench = LoopBench(driver, clock, cost_ns=lambda: 0)
     bench.run()
-    said = [(round((v.t_mono_ns - start_ns) / MS), v.verdict, v.reasons) for v in bench.verdicts]
-    assert said == [
-        (10, Decision.STABLE, []),
-        (10, Decision.UNKNOWN, [Reason.STALE]),
-        (10, Decision.UNKNOWN, [Reason.STALE]),
-        (10, Decision.UNKNOWN, [Reason.STALE]),
-        (400, Decision.STABLE, []),
-    ]
-    assert [round(verdict.age_ms) for verdict in bench.verdicts] == [0, 100, 200, 300, 0]
-    assert [verdict.valid for verdict in bench.verdicts] == [True, False, False, False, True]
-
-
-def test_silence_of_a_slow_driver_is_reported_after_ten_periods() -> None:
-    clock = Clock()
-    start_ns = clock()
-    driver = ScriptedDriver([10, 400], clock, 1000)
-    driver.period_ns = 50 * MS
-    bench = LoopBench(driver, clock)
-    bench.run()
-    assert [verdict.reasons for verdict in bench.verdicts] == [[], [], [Reason.STALE]]
-    assert {verdict.silence_ms for verdict in bench.verdicts} == {500.0}
-    assert bench.verdicts[-1].t_mono_ns == start_ns + 400 * MS
-    assert round(bench.verdicts[-1].age_ms) == 500
+    said = [(round((v.t_mono_ns - start_ns) / MS), round(v.age_ms)) for v in bench.verdicts]
+    assert said == expected
+    assert {verdict.silence_ms for verdict in bench.verdicts} == {limit_ms}
+    for verdict, (_, age_ms) in zip(bench.verdicts, expected, strict=True):
+        is_silence = age_ms > 0
+        assert verdict.verdict is (Decision.UNKNOWN if is_silence else Decision.STABLE)
+        assert verdict.reasons == ([Reason.STALE] if is_silence else [])
+        assert verdict.valid is not is_silence
 
 
 def test_latency_includes_the_wait_behind_other_readings() -> None:

@@ -6,7 +6,7 @@ import itertools
 import logging
 import selectors
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import msgspec
 import numpy as np
@@ -20,33 +20,11 @@ from graspd.daemon.run.overload import YIELD_MAX_NS, mark_repeats
 from graspd.drivers.base import ElectrodeFault, JointReading, Reading, TactileReading
 from tests.daemon.fakes import MS, Clock, FakeDriver, reading, sound
 from tests.daemon.judge.felt_hand import POSES
-from tests.kit.loops import LoopBench
+from tests.kit.loops import LoopBench, TimedDriver
 
 START_NS = Clock().now_ns
 PERIOD_NS = 10 * MS
 SECOND_NS = 1_000_000_000
-
-
-class LiveDriver(FakeDriver):
-    """Live driver that returns the readings made by now, `at_once` at most per call."""
-
-    live = True
-
-    def __init__(self, readings: Sequence[Reading], clock: Clock, at_once: int = 1000) -> None:
-        super().__init__(readings, clock)
-        self.at_once = at_once
-        self.calls = 0
-
-    def due_ns(self) -> int | None:
-        return self.queue[0].t_ns if self.queue else None  # type: ignore[union-attr]
-
-    def read_ready(self) -> list[Reading]:
-        self.calls += 1
-        came = itertools.takewhile(lambda item: item.t_ns <= self.clock(), self.queue)  # type: ignore[union-attr]
-        taken = list(itertools.islice(came, self.at_once))
-        del self.queue[: len(taken)]
-        self.counters.readings += len(taken)
-        return taken  # type: ignore[return-value]
 
 
 class OverloadedLoop(LoopBench):
@@ -80,7 +58,8 @@ def stream(seconds: float, period_ns: int = PERIOD_NS) -> list[Reading]:
 
 def flood(cost_ns: int, seconds: float = 3.0, at_once: int = 1000) -> OverloadedLoop:
     clock = Clock()
-    return OverloadedLoop(LiveDriver(stream(seconds), clock, at_once), clock, lambda: cost_ns)
+    driver = TimedDriver(stream(seconds), clock, at_once=at_once)
+    return OverloadedLoop(driver, clock, lambda: cost_ns)
 
 
 @pytest.mark.parametrize("times", [1.5, 10.0])
@@ -110,7 +89,7 @@ def test_in_overload_the_newest_are_judged_and_all_are_counted(times: float) -> 
 )
 def test_nothing_is_skipped_if_the_backlog_takes_under_10_ms(costs: list[int]) -> None:
     clock, each = Clock(), iter(costs)
-    bench = OverloadedLoop(LiveDriver(stream(1.0), clock), clock, lambda: next(each))
+    bench = OverloadedLoop(TimedDriver(stream(1.0), clock), clock, lambda: next(each))
     assert [seen.seq for _, seen in bench.judged] == list(range(100))
     assert bench.statuses[-1].skipped_readings == 0
     assert bench.gaps == 0
@@ -119,8 +98,7 @@ def test_nothing_is_skipped_if_the_backlog_takes_under_10_ms(costs: list[int]) -
 
 def test_a_recording_is_judged_whole_however_slow_the_judge() -> None:
     clock = Clock()
-    driver = LiveDriver(stream(1.0), clock)
-    driver.live = False
+    driver = TimedDriver(stream(1.0), clock, live=False)
     bench = OverloadedLoop(driver, clock, lambda: 30 * MS)
     assert [seen.seq for _, seen in bench.judged] == list(range(100))
     assert bench.statuses[-1].skipped_readings == 0
@@ -146,7 +124,7 @@ def test_an_overload_is_logged_at_its_begin_and_end(caplog: pytest.LogCaptureFix
         return 30 * MS if clock() < START_NS + 5 * SECOND_NS else 0
 
     with caplog.at_level(logging.INFO, "graspd"):
-        bench = OverloadedLoop(LiveDriver(stream(13.0), clock), clock, cost_ns)
+        bench = OverloadedLoop(TimedDriver(stream(13.0), clock), clock, cost_ns)
     times_s = [(status.t_mono_ns - START_NS) / SECOND_NS for status in bench.statuses]
     said = [status.overloaded for status in bench.statuses]
     assert said[:2] == [False, False]
@@ -161,7 +139,7 @@ def test_readings_skipped_in_one_stall_are_counted_without_overload(
 ) -> None:
     clock = Clock()
     costs = itertools.chain([MS] * 20, [SECOND_NS // 2], itertools.repeat(MS))
-    bench = OverloadedLoop(LiveDriver(stream(3.0), clock), clock, lambda: next(costs))
+    bench = OverloadedLoop(TimedDriver(stream(3.0), clock), clock, lambda: next(costs))
     assert bench.statuses[-1].skipped_readings == 49
     assert not any(status.overloaded for status in bench.statuses)
     assert not caplog.records
@@ -174,7 +152,7 @@ def test_in_overload_no_joint_reading_is_skipped_or_reordered() -> None:
         for number, item in enumerate(stream(2.0))
     ]
     both = [item for pair in zip(angles, stream(2.0), strict=True) for item in pair]
-    bench = OverloadedLoop(LiveDriver(both, clock), clock, lambda: 30 * MS)
+    bench = OverloadedLoop(TimedDriver(both, clock), clock, lambda: 30 * MS)
     assert bench.angles == list(range(200))
     assert bench.statuses[-1].skipped_readings > 100
 
@@ -188,7 +166,7 @@ def test_the_newest_is_judged_even_if_reads_return_only_three() -> None:
 
 def test_a_driver_with_endless_readings_does_not_hold_the_loop() -> None:
     clock = Clock()
-    driver = LiveDriver(stream(0.6, PERIOD_NS // 200), clock, at_once=20)
+    driver = TimedDriver(stream(0.6, PERIOD_NS // 200), clock, at_once=20)
     bench = OverloadedLoop(driver, clock, lambda: 30 * MS)
     rounds = len(bench.rounds_ns)
     assert driver.calls <= (DRAINS_MAX + 1) * rounds
@@ -205,7 +183,7 @@ def test_a_sensor_frozen_among_skipped_readings_is_never_stable() -> None:
             assert isinstance(item, TactileReading)
             item.counts[:] = came[at].counts  # type: ignore[union-attr]
     first = {came[at].t_ns for at in range(100, 200, 10)}
-    bench = OverloadedLoop(LiveDriver(came, clock), clock, lambda: 35 * MS)
+    bench = OverloadedLoop(TimedDriver(came, clock), clock, lambda: 35 * MS)
     frozen = [
         (verdict, seen)
         for verdict, seen in bench.judged
@@ -279,7 +257,7 @@ def test_a_reading_marked_interrupted_makes_the_grasp_settle_again() -> None:
         counts = POSES[pose] + random.integers(-2, 3, (3, 24))
         came.append(sound(counts, START_NS + seq * PERIOD_NS, seq))
     came[200] = msgspec.structs.replace(came[200], interrupted=True)
-    bench = OverloadedLoop(LiveDriver(came, clock), clock, lambda: 0, hand=HandLimits())
+    bench = OverloadedLoop(TimedDriver(came, clock), clock, lambda: 0, hand=HandLimits())
     said = {seen.seq: verdict for verdict, seen in bench.judged}
     assert said[199].verdict is Decision.STABLE
     assert said[200].reasons == [Reason.SEQUENCE_GAP]
