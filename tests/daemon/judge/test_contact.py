@@ -164,14 +164,6 @@ def test_a_finger_touching_alone_for_30_s_is_tared_again() -> None:
     assert contact.tared == [False, True], "half a minute since it was left alone"
 
 
-def test_hold_depth_fades_by_5_counts_per_second() -> None:
-    contact, rest = rested()
-    for t_ns, fall in ((1 * S, 200), (2 * S, 100)):
-        counts = pressed(rest, fall)
-        contact.observe(t_ns, counts, counts, None)
-    assert contact.touches[0].depth == 195.0
-
-
 def test_two_fallen_electrodes_are_not_a_touch_and_three_are() -> None:
     contact, rest = rested()
     for fallen in (2, 3):
