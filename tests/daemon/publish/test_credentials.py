@@ -16,8 +16,6 @@ from typing import Any
 import pytest
 import zmq
 
-from graspd.daemon import scene
-from graspd.daemon.publish import PublishError
 from graspd.daemon.publish.keys import load_pair, make
 from graspd.daemon.publish.sockets import Door, Sockets
 from graspd.daemon.trust.lift_book import GraspId, LiftBook
@@ -127,16 +125,6 @@ def test_only_keys_named_in_ask_tell_may_lift(tmp_path: Path) -> None:
         assert may_lift(sockets, b"key controller")
         for other in (b"", b"key ", b"key dashboard", b"key " + public, b"user 0"):
             assert not may_lift(sockets, other)
-
-
-def test_an_unknown_user_in_ask_tell_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(PublishError, match="there is no user no-such-user"):
-        Sockets(scene_of(tmp_path, ask={"tell": ["no-such-user"]}))
-
-
-def test_ask_tell_on_tcp_without_keys_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(scene.SceneError, match=r"ask\.tell needs an ipc:// socket"):
-        scene_of(tmp_path, ask={"endpoint": "tcp://127.0.0.1:5555", "tell": ["root"]})
 
 
 @pytest.mark.slow

@@ -65,6 +65,11 @@ def test_paths_are_relative_to_the_scene_file(tmp_path: Path) -> None:
         ),
         (GOOD + "[publish]\nendpoint = 'ipc://*'", "publish.endpoint", "not '*'"),
         (GOOD + "[ask]\nendpoint = 'ipc://@graspd'", "ask.endpoint", "no file mode"),
+        (
+            GOOD + "[ask]\nendpoint = 'tcp://127.0.0.1:5555'\ntell = ['root']",
+            "scene",
+            "ask.tell needs an ipc:// socket",
+        ),
         (GOOD + '[publish]\nendpoint = "ipc:///tmp/\\u0000"', "publish.endpoint", "NUL"),
         (GOOD + '[model]\npath = "\\u0000.onnx"', "model.path", "NUL"),
         (PALM + "[gate]\nmode = 'every'", "scene", "gate.mode every is for grasp tables"),
