@@ -121,7 +121,10 @@ def sound(counts: NDArray[np.generic], t_ns: int = 0, seq: int = 0) -> TactileRe
 
 
 class FakeDriver:
-    """Hands over what the test has queued, one reading per call; raises queued errors."""
+    """Hands over what the test has queued, one reading per call; raises queued errors.
+
+    `known`: serial numbers of the sensors by finger.
+    """
 
     name = "fake"
     live = False
@@ -133,6 +136,7 @@ class FakeDriver:
         self.clock = clock
         self.ends = True
         self.is_open = False
+        self.known: dict[str, str] = {}
 
     @property
     def exhausted(self) -> bool:
@@ -140,7 +144,7 @@ class FakeDriver:
 
     @property
     def serials(self) -> dict[str, str]:
-        return {}
+        return self.known
 
     def describe(self) -> dict[str, Fact]:
         return {"made": Fact("by the test")}

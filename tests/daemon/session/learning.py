@@ -89,18 +89,8 @@ def last_kept(folder: Path) -> KeptSession | None:
     return next(iter(kept_in(folder)), None)
 
 
-class SensorDriver(FakeDriver):
-    """A driver whose serial numbers the test sets."""
-
-    known: dict[str, str] = {}  # noqa: RUF012 - set by the test
-
-    @property
-    def serials(self) -> dict[str, str]:
-        return self.known
-
-
-def sensors(**serials: str) -> SensorDriver:
-    driver = SensorDriver([], Clock())
+def sensors(**serials: str) -> FakeDriver:
+    driver = FakeDriver([], Clock())
     driver.known = serials
     return driver
 

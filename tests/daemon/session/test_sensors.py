@@ -23,7 +23,6 @@ from graspd.daemon.session.keeper import SessionKeeper
 from graspd.daemon.session.sensors import FIT_GRASPS, LOOK_EVERY, moved_fingers
 from graspd.daemon.trust.lift_book import GraspId
 from graspd.daemon.trust.trust import Trust
-from graspd.drivers.twins.grasps.grasps import recorded_counts
 from graspd.drivers.twins.grasps.whole_grasps import rest_above
 from graspd.models.judge.session import SessionCalibration
 from graspd.models.trust.risk import BUDGET_START
@@ -92,22 +91,14 @@ def test_an_exchange_is_noticed_with_or_without_kept_sessions(
     assert forgotten == [parts.pipeline]
 
 
-@pytest.fixture(scope="module")
-def tables(bts3_dir: Path) -> dict[str, NDArray[np.uint16]]:
-    """The published grasps of each day, shape (grasps, 3, 24)."""
-    return {
-        name: np.stack(list(recorded_counts(bts3_dir / f"{name}.csv")))
-        for name in ("palm_45", "palm_down", "palm_side")
-    }
-
-
 def test_rests_differ_between_published_days_not_halves_of_one(
-    tables: dict[str, NDArray[np.uint16]],
+    bts3_dir: Path,
 ) -> None:
-    for grasps in tables.values():
+    tables = [Day(name, bts3_dir).grasps for name in ("palm_45", "palm_down", "palm_side")]
+    for grasps in tables:
         half = len(grasps) // 2
         assert moved_fingers(rest_above(grasps[:half]), rest_above(grasps[half:])) == []
-    for one, other in itertools.combinations(tables.values(), 2):
+    for one, other in itertools.combinations(tables, 2):
         assert moved_fingers(rest_above(one), rest_above(other)) == [0]
 
 
