@@ -42,6 +42,10 @@ OFFSET_NS = 10**18
 START_NS = 5 * 10**12
 PERIOD_NS = 10_000_000
 READINGS = 20
+READING = {
+    **{"v": 1, "boot_id": BOOT, "seq": 1, "t": 0.0, "t_mono_ns": START_NS},
+    **{"fingers": ["ff"], "counts": [1] * 24, "faults": [0] * 24},
+}
 NOW_NS = 7 * 10**12
 REQUIRED = ("fingers", "joints", "boot_id", "scene", "model", "model_sha256")
 """Fields of a header without which a file is refused."""
@@ -202,25 +206,21 @@ def test_a_message_of_a_time_beyond_64_bits_is_refused(tmp_path: Path) -> None:
 
 def test_malformed_readings_are_counted_and_left_out(tmp_path: Path) -> None:
     file = McapWriter(tmp_path / "a.mcap", header("ff", joints=False))
-    good = {
-        **{"v": 1, "boot_id": BOOT, "seq": 1, "t": 0.0, "t_mono_ns": 5},
-        **{"fingers": ["ff"], "counts": [1] * 24, "faults": [0] * 24},
-    }
     wrong = [
         b"",
         b"{}",
         b"\xff",
-        json.dumps(good | {"counts": [1] * 23}).encode(),
-        json.dumps(good | {"counts": [-1] * 24}).encode(),
-        json.dumps(good | {"counts": [70_000] * 24}).encode(),
-        json.dumps(good | {"fingers": ["mf"]}).encode(),
-        json.dumps(good | {"faults": []}).encode(),
+        json.dumps(READING | {"counts": [1] * 23}).encode(),
+        json.dumps(READING | {"counts": [-1] * 24}).encode(),
+        json.dumps(READING | {"counts": [70_000] * 24}).encode(),
+        json.dumps(READING | {"fingers": ["mf"]}).encode(),
+        json.dumps(READING | {"faults": []}).encode(),
     ]
     for payload in wrong:
         file.write(b"tactile.right", payload, 10)
     file.write(b"joints.right", b'{"seq":1,"t_mono_ns":1,"names":["FFJ3"],"position_rad":[]}', 10)
     file.write(b"strange.right", b"{}", 10)
-    file.write(b"tactile.right", json.dumps(good).encode(), 10)
+    file.write(b"tactile.right", json.dumps(READING).encode(), 10)
     file.close()
     with McapReplayDriver([tmp_path / "a.mcap"], ("ff",)) as driver:
         assert len(driver.read_ready()) == 1

@@ -22,7 +22,7 @@ from graspd.daemon.record.player import McapReplayDriver, RecordedEvent
 from graspd.daemon.record.topics import Late
 from graspd.drivers.base import RecordingError
 from tests.daemon.record.recorded import BOOT
-from tests.daemon.record.test_mcap import OFFSET_NS, START_NS, WHOLE, header, read
+from tests.daemon.record.test_mcap import OFFSET_NS, READING, START_NS, WHOLE, header, read
 
 
 def packed_again(
@@ -132,10 +132,6 @@ def test_readings_of_another_run_are_refused(
         assert driver.counters.readings == 10
 
 
-READING = {
-    **{"v": 1, "boot_id": BOOT, "seq": 1, "t": 0.0, "t_mono_ns": START_NS},
-    **{"fingers": ["ff"], "counts": [1] * 24, "faults": [0] * 24},
-}
 LINES: dict[str, tuple[str, object]] = {
     "tactile": ("tactile", READING),
     "stale": ("verdict", {"reasons": ["stale"]}),
