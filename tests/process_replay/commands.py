@@ -97,8 +97,6 @@ COMMANDS: Final[Mapping[str, str]] = {
     "keys-list": "keys list --dir keys",
     "schema": "schema",
     "scene-example": "scene --example spi",
-    "scene-page": "scene --page",
-    "scene-schema": "scene --schema",
     "export-grasps": "export-grasps recorded.mcap --out grasps.csv",
     "export-grasps-there": "export-grasps recorded.mcap --out grasps.csv",
     "export-grasps-table": "export-grasps table.csv --out other.csv",

@@ -78,11 +78,6 @@ CASES: Final[Mapping[str, Case]] = {
 """Runs of the loop by name. `readings_max` counts joint readings too."""
 
 
-def _mcap(folder: Path) -> list[str]:
-    run(CASES["request_risk"], record_in=folder)
-    return [str(path) for path in sorted(folder.glob("*.mcap"))]
-
-
 def _serial_log(folder: Path) -> list[str]:
     sensors = f'driver = "spi"\nport = "none"\nsensors = {json.dumps(WIRED)}'
     return _link_log(folder, "serial", sensors, streams.spi)
@@ -105,7 +100,6 @@ def _link_log(
 
 
 REPLAYED: Final[Mapping[str, Callable[[Path], list[str]]]] = {
-    "mcap": _mcap,
     "serial_log": _serial_log,
     "can_log": _can_log,
 }
