@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
 import shutil
@@ -16,8 +15,8 @@ import zmq
 from graspd.daemon.cli import COMMANDS, LIBRARIES, whole_parser
 from tests.conftest import ROOT
 from tests.daemon.commands.shell_files import PAGE, manual, parsers
-from tests.daemon.processes import GRASPD
 from tests.kit.inside import graspd
+from tests.kit.terminal import Terminal
 
 EXTRAS = (
     "torch", "sklearn", "scipy", "joblib", "threadpoolctl", "onnx", "onnxscript", "skl2onnx",
@@ -113,32 +112,16 @@ def test_the_version_option_prints_python_and_library_versions_too() -> None:
     assert told == {name: version(name) for name in LIBRARIES}
 
 
-def on_a_terminal(setting: dict[str, str], *arguments: str) -> bytes:
-    """What graspd with `arguments` writes to a terminal; `setting`: added to the environment."""
-    own, terminal = os.openpty()
-    environment = {**os.environ, "TERM": "xterm", "NO_COLOR": "", **setting}
-    with subprocess.Popen(
-        [*GRASPD, *arguments], stdout=terminal, stderr=terminal, env=environment
-    ) as process:
-        os.close(terminal)
-        text = b""
-        with contextlib.suppress(OSError):  # the end of a terminal without another end
-            while part := os.read(own, 1 << 16):
-                text += part
-    os.close(own)
-    assert process.returncode == 0
-    return text
-
-
 @pytest.mark.parametrize(
     ("setting", "is_coloured"), [({}, True), ({"NO_COLOR": "1"}, False), ({"TERM": "dumb"}, False)]
 )
 def test_verdicts_are_coloured_on_a_terminal_unless_switched_off(
     setting: dict[str, str], is_coloured: bool
 ) -> None:
-    text = on_a_terminal(setting, "replay", "--verbose")
-    assert (b"\x1b[32mstable" in text) == is_coloured
-    assert (b"\x1b" in text) == is_coloured
+    with Terminal("replay", "--verbose", **{"NO_COLOR": "", **setting}) as terminal:
+        assert terminal.end() == 0
+    assert (b"\x1b[32mstable" in terminal.output) == is_coloured
+    assert (b"\x1b" in terminal.output) == is_coloured
 
 
 @pytest.mark.skipif(sys.version_info[:2] != (3, 11), reason="argparse says usage otherwise")

@@ -12,16 +12,21 @@ from tests.daemon.watch.watch_fakes import Talker
 
 
 @pytest.fixture
-def page(tmp_path: Path) -> Iterator[Page]:
-    made = Page(f"ipc://{tmp_path}/v")
+def endpoint(tmp_path: Path) -> str:
+    return f"ipc://{tmp_path}/v"
+
+
+@pytest.fixture
+def page(endpoint: str) -> Iterator[Page]:
+    made = Page(endpoint)
     made.start()
     yield made
     made.stop()
 
 
 @pytest.fixture
-def talker(tmp_path: Path) -> Iterator[Talker]:
-    with Talker(f"ipc://{tmp_path}/v") as made:
+def talker(endpoint: str) -> Iterator[Talker]:
+    with Talker(endpoint) as made:
         yield made
 
 

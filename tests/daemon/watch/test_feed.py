@@ -23,11 +23,6 @@ from tests.ports import free_ipv6_endpoint
 Keys = tuple[bytes, bytes, bytes]
 
 
-@pytest.fixture
-def endpoint(tmp_path: Path) -> str:
-    return f"ipc://{tmp_path}/v"
-
-
 def first_of(publisher: Publisher, feed: Feed, seq: int, decision: Decision) -> list[bytes]:
     """Publish a verdict until messages come to `feed`; return their payloads."""
     found: list[bytes] = []

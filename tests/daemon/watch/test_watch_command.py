@@ -2,100 +2,25 @@
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
 import json
-import os
-import pty
 import re
 import signal
 import socket
-import struct
-import subprocess
-import termios
 from pathlib import Path
-from typing import Self
-
-import pytest
 
 from graspd.daemon.judge.reasons import Decision
-from tests.daemon.processes import GRASPD, start
+from tests.daemon.processes import start
 from tests.daemon.watch.watch_fakes import Talker
-from tests.kit.waiting import PATIENCE_S, wait_until
+from tests.kit.terminal import Terminal
+from tests.kit.waiting import PATIENCE_S
 from tests.ports import free_port
 
 ENTER, LEAVE = b"\x1b[?1049h", b"\x1b[?1049l"
 """Codes that enter and leave the alternate screen (xterm)."""
 
 
-@pytest.fixture
-def port() -> int:
-    return free_port()
-
-
-class Terminal:
-    """A pseudo-terminal in which `graspd watch` runs."""
-
-    def __init__(self, *arguments: str, columns: int = 80, lines: int = 24) -> None:
-        self._arguments = arguments
-        self._size = struct.pack("HHHH", lines, columns, 0, 0)
-        self.output = b""
-
-    def __enter__(self) -> Self:
-        self._ours, theirs = pty.openpty()
-        fcntl.ioctl(theirs, termios.TIOCSWINSZ, self._size)
-        self.former = termios.tcgetattr(self._ours)
-        self.process = subprocess.Popen(
-            ["setsid", "--ctty", *GRASPD, "watch", *self._arguments],
-            stdin=theirs,
-            stdout=theirs,
-            stderr=theirs,
-            env={**os.environ, "TERM": "xterm-256color"},
-        )
-        os.close(theirs)
-        return self
-
-    def __exit__(self, *_details: object) -> None:
-        self.process.kill()
-        self.process.wait()
-        os.close(self._ours)
-
-    def read_until(self, pattern: bytes) -> None:
-        """Wait until what the command writes from now on matches `pattern`."""
-        self.output = b""
-        os.set_blocking(self._ours, False)
-        wait_until(lambda: self.read() or re.search(pattern, self.output, re.DOTALL), 0.02)
-
-    def read(self) -> bool:
-        """Add what the command has written to `output`; always return False."""
-        with contextlib.suppress(BlockingIOError, OSError):
-            while part := os.read(self._ours, 1 << 16):
-                self.output += part
-        return False
-
-    def type(self, keys: bytes) -> None:
-        os.write(self._ours, keys)
-
-    def resize(self, columns: int, lines: int) -> None:
-        fcntl.ioctl(self._ours, termios.TIOCSWINSZ, struct.pack("HHHH", lines, columns, 0, 0))
-
-    def end(self) -> int:
-        """Wait until the command ends; return its exit code."""
-        wait_until(lambda: self.read() or self.process.poll() is not None, 0.02)
-        self.read()
-        return self.process.returncode
-
-    def settings(self) -> list[object]:
-        return termios.tcgetattr(self._ours)
-
-
-@pytest.fixture
-def endpoint(tmp_path: Path) -> str:
-    return f"ipc://{tmp_path}/v"
-
-
 def test_watch_in_a_terminal_shows_verdicts_and_ends_cleanly(endpoint: str) -> None:
-    with Talker(endpoint) as talker, Terminal("--connect", endpoint) as terminal:
+    with Talker(endpoint) as talker, Terminal("watch", "--connect", endpoint) as terminal:
         terminal.read_until(re.escape(ENTER))
         talker.decision = Decision.SLIP
         terminal.read_until(rb"do not lift")
@@ -132,7 +57,8 @@ def two_scenes(tmp_path: Path) -> list[str]:
     return paths
 
 
-def test_several_scenes_are_one_page_of_one_process(tmp_path: Path, port: int) -> None:
+def test_several_scenes_are_one_page_of_one_process(tmp_path: Path) -> None:
+    port = free_port()
     with (
         Talker(f"ipc://{tmp_path}/right") as talker,
         start("watch", "--web", *two_scenes(tmp_path), "--port", port) as page,
