@@ -16,14 +16,16 @@ def written(folder: Path, text: str) -> Path:
     return path
 
 
-def demo_scene(folder: Path, tactile: str = "", *, sections: str = "") -> Path:
-    """Write a scene of the demo table that publishes at `v` in `folder`; return its path.
+def demo_scene(
+    folder: Path, tactile: str = "", *, sections: str = "", recording: Path = DEMO_TABLE
+) -> Path:
+    """Write a scene of a recording that publishes at `v` in `folder`; return its path.
 
     `tactile` has further lines of `[tactile]`, `sections` further sections.
     """
     return written(
         folder,
-        f'[tactile]\ndriver = "replay"\nrecordings = ["{DEMO_TABLE}"]\n{tactile}\n'
+        f'[tactile]\ndriver = "replay"\nrecordings = ["{recording}"]\n{tactile}\n'
         f'[publish]\nendpoint = "ipc://{folder}/v"\n{sections}\n',
     )
 

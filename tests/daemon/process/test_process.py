@@ -18,7 +18,7 @@ from graspd.drivers.recordings.csv_player import DEMO_TABLE, SHOW_RECORDING
 from tests.daemon.processes import GRASPD, TIMEOUT_S, start, wait_for
 from tests.kit.crowd import SELECT_MAX, crowded
 from tests.kit.programs import ran
-from tests.kit.scenes import demo_scene, written
+from tests.kit.scenes import demo_scene
 
 ROOT = Path(__file__).parents[3]
 DEMO_SCENE = ROOT / "deploy" / "scenes" / "demo.toml"
@@ -80,11 +80,8 @@ Loop.run = noting
 
 
 def test_the_loop_loads_no_module_while_it_runs(tmp_path: Path) -> None:
-    scene = written(
-        tmp_path,
-        f'[tactile]\ndriver = "replay"\nrecordings = ["{SHOW_RECORDING}"]\npace = "fast"\n'
-        f'outcomes = true\n[publish]\nendpoint = "ipc://{tmp_path}/v"\n',
-    )
+    keys = 'pace = "fast"\noutcomes = true'
+    scene = demo_scene(tmp_path, keys, recording=SHOW_RECORDING)
     assert python(LOADED, "run", scene).stdout.splitlines() == ["[]"]
 
 

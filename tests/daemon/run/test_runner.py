@@ -6,36 +6,26 @@ import logging
 import re
 import signal
 import socket
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-import zmq
 
 from graspd.daemon.judge.reasons import Decision, Reason
 from graspd.daemon.process.signals import StopSignal
-from graspd.daemon.publish.messages import State, Verdict
+from graspd.daemon.publish.messages import State
 from graspd.daemon.run.loop import Ended, Loop
 from graspd.daemon.run.runner import run_scene
 from graspd.daemon.scene import SceneError
 from graspd.drivers.base import DriverError
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
+from tests.bench.live import Subscriber
 from tests.clients.building import sleep_at_will
 from tests.daemon.processes import put_first, start
-from tests.kit.messages import decode_status, decode_verdict
+from tests.kit.messages import decode_status
 from tests.kit.scenes import demo_scene
 from tests.kit.waiting import PATIENCE_S
-
-SCENE = """
-[tactile]
-driver = "replay"
-recordings = ["{recording}"]
-loop = true
-[publish]
-endpoint = "ipc://{folder}/v"
-"""
 
 
 class Running:
@@ -43,20 +33,17 @@ class Running:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.scene = folder / "scene.toml"
-        self.scene.write_text(SCENE.format(recording=DEMO_RECORDING, folder=folder))
+        self.scene = demo_scene(folder, "loop = true", recording=DEMO_RECORDING)
 
     @contextmanager
     def started(self) -> Iterator[Running]:
         with (
             socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as self.ears,
-            zmq.Context() as self.context,
-            self.context.socket(zmq.SUB) as self.subscriber,
+            Subscriber(f"ipc://{self.folder}/v") as self.verdicts,
+            Subscriber(f"ipc://{self.folder}/v", topics=("status.",)) as self.statuses,
         ):
             self.ears.bind(str(self.folder / "notify"))
             self.ears.settimeout(PATIENCE_S)
-            self.subscriber.connect(f"ipc://{self.folder}/v")
-            self.subscriber.subscribe("")
             manager = f"NOTIFY_SOCKET={self.folder}/notify", "WATCHDOG_USEC=400000"
             with start("run", self.scene, before=("env", *manager)) as self.process:
                 put_first(self.process.pid)
@@ -72,20 +59,10 @@ class Running:
             if any(text.startswith(line) for text in message):
                 return message
 
-    def verdict(self, like: Callable[[Verdict], bool] = lambda _verdict: True) -> Verdict:
-        """Wait for a verdict for which `like` is true, and return it."""
-        deadline_s = time.monotonic() + PATIENCE_S
-        while time.monotonic() < deadline_s and self.subscriber.poll(int(PATIENCE_S * 1e3)):
-            topic, payload = self.subscriber.recv_multipart()
-            if topic == b"verdict.right" and like(verdict := decode_verdict(payload)):
-                return verdict
-        pytest.fail("no such verdict")
-
     def stops(self) -> bool:
         """Wait for a status of the state `stopping`; return False if none comes."""
-        while self.subscriber.poll(int(PATIENCE_S * 1e3)):
-            topic, payload = self.subscriber.recv_multipart()
-            if topic == b"status.right" and decode_status(payload).state is State.STOPPING:
+        while (message := self.statuses.take(PATIENCE_S)) is not None:
+            if decode_status(message[1]).state is State.STOPPING:
                 return True
         return False
 
@@ -102,7 +79,7 @@ def running(tmp_path: Path) -> Iterator[Running]:
 
 
 def test_ready_comes_first_and_then_the_watchdog_is_fed(running: Running) -> None:
-    assert running.verdict().model == "small-session"
+    assert running.verdicts.wait_for(lambda _verdict: True).model == "small-session"
     for _ in range(3):
         assert running.told("WATCHDOG=1") == ["WATCHDOG=1"]
     assert "readings/s" in running.told("STATUS=running")[0]
@@ -110,7 +87,7 @@ def test_ready_comes_first_and_then_the_watchdog_is_fed(running: Running) -> Non
 
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_daemon_and_is_logged(running: Running, number: signal.Signals) -> None:
-    seen = running.verdict(like=lambda verdict: verdict.seq >= 20)
+    seen = running.verdicts.wait_for(lambda verdict: verdict.seq >= 20)
     running.process.send_signal(number)
     code, said = running.end()
     *_, last = said.splitlines()
@@ -159,9 +136,9 @@ def test_a_sleep_ends_the_daemon_with_an_error(
     slept = sleep_at_will(tmp_path, monkeypatch)
     with Running(tmp_path).started() as running:
         running.told("READY=1")
-        running.verdict(like=lambda verdict: verdict.verdict is not Decision.UNKNOWN)
+        running.verdicts.wait_for(lambda verdict: verdict.verdict is not Decision.UNKNOWN)
         slept.touch()
-        last = running.verdict(like=lambda verdict: verdict.reasons[:1] == [Reason.STALE])
+        last = running.verdicts.wait_for(lambda verdict: verdict.reasons[:1] == [Reason.STALE])
         code, said = running.end()
         assert running.stops()
     assert last.verdict is Decision.UNKNOWN
