@@ -29,6 +29,21 @@ def graspd(*arguments: object) -> CompletedProcess[str]:
     return CompletedProcess(words, code, output.getvalue(), errors.getvalue())
 
 
+def output(*arguments: object) -> str:
+    """Run a command that succeeds; return what it writes to stdout."""
+    done = graspd(*arguments)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def refused(*arguments: object) -> str:
+    """Run a command that is refused with exit code 2; return what it writes to stderr."""
+    done = graspd(*arguments)
+    assert done.returncode == 2, done.stderr
+    assert "Traceback" not in done.stderr
+    return done.stderr
+
+
 @contextlib.contextmanager
 def _as_it_was() -> Iterator[None]:
     """Let the block set up its log and limits as in a new process; restore both after it."""

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.kit.inside import graspd
+from tests.kit.inside import graspd, output, refused
 from tests.kit.scenes import demo_scene, written
 
 ABSENT = os.sysconf("SC_NPROCESSORS_CONF")
@@ -32,9 +32,7 @@ SOCKETCAND = 'interface = "socketcand"\noptions = { host = "127.0.0.1", '
 )
 def test_check_finds_what_run_refuses(section: str, says: str, tmp_path: Path) -> None:
     scene = demo_scene(tmp_path, sections=section.replace("F/", f"{tmp_path}/"))
-    refused = graspd("check", scene)
-    assert refused.returncode == 2
-    (line,) = refused.stderr.splitlines()
+    (line,) = refused("check", scene).splitlines()
     assert says.replace("F/", f"{tmp_path}/") in line
     assert graspd("run", scene).returncode != 0
 
@@ -67,18 +65,14 @@ def test_check_finds_what_run_refuses(section: str, says: str, tmp_path: Path) -
 def test_check_finds_a_can_bus_that_can_never_open(keys: str, says: str, tmp_path: Path) -> None:
     scene = written(tmp_path, CAN.format(keys, tmp_path))
     for command in ("check", "run"):
-        refused = graspd(command, scene)
-        assert refused.returncode == 2
-        (line,) = refused.stderr.splitlines()
+        (line,) = refused(command, scene).splitlines()
         assert line.startswith(f"graspd: [tactile] {says}")
         assert "pip install" not in line
 
 
 def checked(folder: Path, text: str) -> dict[str, Any]:
     """The JSON document that `graspd check` prints on a right scene with this text."""
-    result = graspd("check", written(folder, text), "--json")
-    assert result.returncode == 0, result.stderr
-    document: dict[str, Any] = json.loads(result.stdout)
+    document: dict[str, Any] = json.loads(output("check", written(folder, text), "--json"))
     return document
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from graspd.models.bts3 import TABLES
-from tests.kit.inside import graspd
+from tests.kit.inside import graspd, output
 
 
 class QuietHandler(http.server.SimpleHTTPRequestHandler):
@@ -44,16 +44,13 @@ def test_data_is_fetched_and_checked(
     folder, address = mirror
     for table in TABLES:
         (folder / table.upstream_name).write_bytes((bts3_dir / f"{table.name}.csv").read_bytes())
-    result = graspd("data", "--to", tmp_path / "data", "--url", address)
-    assert result.returncode == 0, result.stderr
+    output("data", "--to", tmp_path / "data", "--url", address)
     for table in TABLES:
         content = (tmp_path / "data" / f"{table.name}.csv").read_bytes()
         assert hashlib.sha256(content).hexdigest() == table.sha256
-    again = graspd("data", "--to", tmp_path / "data", "--url", "http://127.0.0.1:9")
-    assert again.returncode == 0
-    assert again.stdout.count("is there") == 3
-    copied = graspd("data", "--to", tmp_path / "copy", "--from", tmp_path / "data")
-    assert copied.returncode == 0
+    again = output("data", "--to", tmp_path / "data", "--url", "http://127.0.0.1:9")
+    assert again.count("is there") == 3
+    output("data", "--to", tmp_path / "copy", "--from", tmp_path / "data")
     assert len(list((tmp_path / "copy").iterdir())) == 3
 
 

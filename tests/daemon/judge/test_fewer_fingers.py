@@ -10,7 +10,7 @@ import pytest
 
 from graspd.daemon.publish.messages import Verdict
 from graspd.drivers.recordings.csv_player import DEMO_TABLE
-from tests.kit.inside import graspd
+from tests.kit.inside import output, refused
 from tests.kit.messages import decode_verdict
 
 HANDS = {"small-session-th": ("th",), "small-session-ff-th": ("ff", "th")}
@@ -39,19 +39,17 @@ def verdicts_of(text: str) -> list[Verdict]:
 
 @pytest.mark.parametrize("name", HANDS)
 def test_a_table_without_unused_fingers_gets_the_same_verdicts(name: str, tmp_path: Path) -> None:
-    part = graspd("replay", cut(DEMO_TABLE, HANDS[name], tmp_path), "--model", name, "--json")
-    whole = graspd("replay", DEMO_TABLE, "--model", name, "--json")
-    assert part.returncode == whole.returncode == 0, part.stderr
-    verdicts = verdicts_of(part.stdout)
+    part = output("replay", cut(DEMO_TABLE, HANDS[name], tmp_path), "--model", name, "--json")
+    whole = output("replay", DEMO_TABLE, "--model", name, "--json")
+    verdicts = verdicts_of(part)
     assert len(verdicts) == 200
     assert {verdict.model for verdict in verdicts} == {name}
     assert sum(verdict.valid for verdict in verdicts) > 150
     assert [(v.verdict, v.p_slip, v.reasons) for v in verdicts] == [
-        (v.verdict, v.p_slip, v.reasons) for v in verdicts_of(whole.stdout)
+        (v.verdict, v.p_slip, v.reasons) for v in verdicts_of(whole)
     ]
 
 
 def test_a_table_without_a_finger_of_the_model_is_refused(tmp_path: Path) -> None:
-    result = graspd("replay", cut(DEMO_TABLE, ("ff", "th"), tmp_path))
-    assert result.returncode == 2
-    assert "has ff, th; small-session also needs mf" in result.stderr
+    problem = refused("replay", cut(DEMO_TABLE, ("ff", "th"), tmp_path))
+    assert "has ff, th; small-session also needs mf" in problem

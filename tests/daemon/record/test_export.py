@@ -26,7 +26,7 @@ from graspd.drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
 from graspd.models.training.data.datasets import read_table
 from tests.daemon.record import recorded
 from tests.daemon.record.recorded import BOOT
-from tests.kit.inside import graspd
+from tests.kit.inside import graspd, output
 from tests.kit.scenes import demo_scene
 
 Ending = Literal["stable", "slip"]
@@ -150,11 +150,8 @@ def test_an_exported_grasp_without_object_gets_that_of_the_option(tmp_path: Path
     writer.close()
     out = tmp_path / "t.csv"
     for options, other in (((), "unknown"), (("--object", "cup"), "cup")):
-        result = graspd("export-grasps", tmp_path / "a.mcap", "--out", out, "--force", *options)
-        assert result.returncode == 0, result.stderr
-        assert result.stdout == (
-            "6 grasps, 2 slipped; 3 objects by name; 3 grasps without an object\n"
-        )
+        text = output("export-grasps", tmp_path / "a.mcap", "--out", out, "--force", *options)
+        assert text == "6 grasps, 2 slipped; 3 objects by name; 3 grasps without an object\n"
         table = read_table(out)
         assert table.objects == ("mug", "ball", other, other, "box", other)
         assert table.slipped.tolist() == [True, False, False, True, False, False]

@@ -11,7 +11,7 @@ from graspd import load, read_grasps, read_recording
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
 from graspd.drivers.recordings.layout import layout_of
 from graspd.models.training.data.datasets import read_table
-from tests.kit.inside import graspd
+from tests.kit.inside import refused
 
 pd = pytest.importorskip("pandas", reason="needs the extra pandas")
 WRITERS: dict[str, Callable[[Path], object]] = {
@@ -80,8 +80,7 @@ def test_no_command_reads_sweeps_without_times_as_grasps(
         '[tactile]\ndriver = "replay"\nrecordings = ["sweeps.csv"]\n'
         '[session]\nkeep = true\nfolder = "session"\n'
     )
-    done = graspd(*words, "sweeps.csv")
-    assert done.returncode == 2
-    assert "rows nearly repeat another: sweeps of a stream (--as stream" in done.stderr
+    says = "rows nearly repeat another: sweeps of a stream (--as stream"
+    assert says in refused(*words, "sweeps.csv")
     assert not list(tmp_path.glob("session/*.session"))
-    assert graspd("replay", DEMO_RECORDING, "--gate", "every").returncode == 2
+    refused("replay", DEMO_RECORDING, "--gate", "every")

@@ -24,7 +24,7 @@ from graspd.daemon.assembly.recordings import RecordedRun
 from graspd.daemon.publish.messages import encode
 from graspd.models.training.data.datasets import read_table
 from tests.daemon.record.recorded import compared, files, messages, without_null
-from tests.kit.inside import graspd
+from tests.kit.inside import graspd, output
 from tests.process_replay.judging import Case, run
 from tests.process_replay.streams import demo
 
@@ -80,9 +80,7 @@ def of_readings(path: Path) -> list[dict[str, Any]]:
 @cache
 def again(*arguments: object) -> list[dict[str, Any]]:
     """Return the verdicts of `graspd replay --json` with `arguments`; the same ones run once."""
-    result = graspd("replay", "--json", *arguments)
-    assert result.returncode == 0, result.stderr
-    return [json.loads(line) for line in result.stdout.splitlines()]
+    return [json.loads(line) for line in output("replay", "--json", *arguments).splitlines()]
 
 
 def test_a_recording_has_all_that_was_published_and_the_joints(lab: Lab) -> None:

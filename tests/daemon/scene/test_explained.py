@@ -11,7 +11,7 @@ import jsonschema
 import pytest
 
 from graspd.daemon.scene import explained
-from tests.kit.inside import graspd
+from tests.kit.inside import graspd, output
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
 SCHEMA = explained.schema()
@@ -77,14 +77,13 @@ def test_the_page_of_all_keys_is_up_to_date() -> None:
 
 @pytest.mark.parametrize("name", explained.examples())
 def test_an_example_scene_passes_check_in_any_folder(name: str, tmp_path: Path) -> None:
-    result = graspd("scene", "--example", name)
-    assert result.returncode == 0, result.stderr
+    text = output("scene", "--example", name)
     path = tmp_path / "right.toml"
-    path.write_text(result.stdout)
-    assert result.stdout.startswith("#:schema file:///")
+    path.write_text(text)
+    assert text.startswith("#:schema file:///")
     file = DEPLOY / "scenes" / f"{name}.toml"
     assert file.read_text().startswith(f"#:schema ./{explained.SCHEMA}\n")
-    assert len(result.stdout.splitlines()) == len(file.read_text().splitlines())
+    assert len(text.splitlines()) == len(file.read_text().splitlines())
     checked = graspd("check", path)
     assert (checked.returncode, checked.stdout.splitlines()[0]) == (0, f"{path}: fine")
-    jsonschema.validate(tomllib.loads(result.stdout), SCHEMA)
+    jsonschema.validate(tomllib.loads(text), SCHEMA)
