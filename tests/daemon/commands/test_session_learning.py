@@ -26,26 +26,23 @@ from graspd.drivers.twins.grasps.grasp_script import EndPoint
 from graspd.drivers.twins.grasps.whole_grasps import RATE_HZ, WholeGrasps, rest_above
 from tests.daemon.record.test_export import Writer
 from tests.daemon.session.learning import SHORT, kept_in, last_kept
-from tests.kit.inside import graspd
+from tests.kit.inside import graspd, output, refused
 from tests.kit.scenes import session_scene, unlabelled_demo
 
 FINGERS = ("ff", "mf", "th")
 ROWS = list(read_rows(DEMO_TABLE, FINGERS))
 
 
-def seed(path: Path, recording: Path) -> TrustState | None:
-    """Seed the session from a recording; return what it has learned (None: nothing)."""
-    seeded = graspd("session", "seed", path, recording)
-    assert seeded.returncode == 0, seeded.stderr
+def seed(path: Path, recording: Path) -> TrustState:
+    """Seed the session from a recording; return what it has learned."""
+    output("session", "seed", path, recording)
     kept = last_kept(path.with_name("right"))
-    assert kept is not None
-    return None if kept.trust is None else kept.trust
+    assert kept.trust is not None
+    return kept.trust
 
 
 def shown(path: Path) -> dict[str, Any]:
-    result = graspd("session", "show", path, "--json")
-    assert result.returncode == 0, result.stderr
-    document: dict[str, Any] = json.loads(result.stdout)
+    document: dict[str, Any] = json.loads(output("session", "show", path, "--json"))
     return document
 
 
@@ -60,7 +57,6 @@ def live_trust(path: Path) -> Trust:
 def test_seeding_from_a_table_teaches_but_counts_no_lifts(tmp_path: Path) -> None:
     path = session_scene(tmp_path, sections="[risk]\nmax_slip_when_stable = 0.1\n")
     learned = seed(path, DEMO_TABLE)
-    assert learned is not None
     known = sum(row.annotation.slipped is not None for row in ROWS)
     assert known * 0.9 < learned.learner.outcomes <= known == len(ROWS)
     trust, fresh = live_trust(path), live_trust(path)
@@ -91,8 +87,6 @@ def test_seeding_from_a_stream_keeps_the_sensors_resting_counts(tmp_path: Path) 
     path = session_scene(tmp_path, sections="[risk]\nmax_slip_when_stable = 0.1\nwarm_up = 5\n")
     learned = seed(path, recording)
     kept = last_kept(tmp_path / "right")
-    assert learned is not None
-    assert kept is not None
     assert kept.rest is not None
     assert np.abs(np.array(kept.rest) - rest.ravel()).max() < 10.0  # of measured noise
     assert learned.risk.proven == learned.learner.outcomes > 5
@@ -113,11 +107,9 @@ def test_a_recording_teaches_as_the_table_of_its_grasps_does(tmp_path: Path) -> 
 
 def test_seeding_a_model_without_session_needs_known_outcomes(tmp_path: Path) -> None:
     path = session_scene(tmp_path, model="mlp")
-    refused = graspd("session", "seed", path, unlabelled_demo(tmp_path))
-    assert refused.returncode == 2
-    assert "none is a grasp whose outcome is known" in refused.stderr
+    problem = refused("session", "seed", path, unlabelled_demo(tmp_path))
+    assert "none is a grasp whose outcome is known" in problem
     learned = seed(path, DEMO_TABLE)
-    assert learned is not None
     assert learned.learner.outcomes > 0.9 * len(ROWS)
     document = shown(path)
     assert document["session"]["statistics"] is None
@@ -141,7 +133,6 @@ def test_seeding_refuses_outcomes_that_cannot_be_read(tmp_path: Path) -> None:
 
 def test_seeding_with_learning_off_keeps_what_was_learned(tmp_path: Path) -> None:
     learned = seed(session_scene(tmp_path), DEMO_TABLE)
-    assert learned is not None
     assert learned.learner.outcomes > 0
     off = session_scene(tmp_path, sections="[learn]\nenabled = false\n")
     assert seed(off, unlabelled_demo(tmp_path)) == learned
@@ -153,13 +144,11 @@ def test_reset_forgets_a_session_unless_another_graspd_uses_it(tmp_path: Path) -
     with SessionFolder(kept) as folder:
         folder.load()
         first = last_kept(kept)
-        assert first is not None
         folder.save([KeptSession(first.statistics, FINGERS, {})])
     assert "  learned  nothing" in graspd("session", "show", path).stdout
     with SessionFolder(kept):
         for arguments in (("reset", path), ("seed", path, DEMO_TABLE)):
-            refused = graspd("session", *arguments)
-            assert (refused.returncode, "in use by another graspd" in refused.stderr) == (2, True)
+            assert "in use by another graspd" in refused("session", *arguments)
     seed(path, DEMO_TABLE)
     assert graspd("session", "reset", path).stdout.endswith(": forgotten\n")
     assert shown(path)["session"] is None
@@ -176,18 +165,17 @@ def test_settling_announced_lifts_learns_as_if_their_controller_reported(tmp_pat
         trust.lifts.announce()
     with SessionFolder(kept) as folder:
         folder.save([KeptSession(None, FINGERS, {"ff": "A"}, trust.state())])
-        refused = graspd("session", "settle", path)
-        assert "in use by another graspd, stop that one first" in refused.stderr
+        problem = refused("session", "settle", path)
+        assert "in use by another graspd, stop that one first" in problem
     names = [f"01234567-{number}" for number in range(1, 6)]
     assert graspd("session", "settle", path).stdout.splitlines()[1:] == names
-    unknown = graspd("session", "settle", path, "01234567-9", "--as", "held")
-    assert (unknown.returncode, "01234567-9: not open" in unknown.stderr) == (2, True)
+    problem = refused("session", "settle", path, "01234567-9", "--as", "held")
+    assert "01234567-9: not open" in problem
     for told, lifts in (("slipped", names[:1]), ("not-lifted", names[1:3]), ("held", ())):
-        assert graspd("session", "settle", path, *lifts, "--as", told).returncode == 0
+        output("session", "settle", path, *lifts, "--as", told)
     for number, slipped in ((1, True), (4, False), (5, False)):
         trust.outcome(GraspId(boot, number), slipped=slipped)
     now, found = last_kept(kept), live_trust(path)
-    assert now is not None
     assert now.trust is not None
     assert now.serials == {"ff": "A"}
     found.restore(now.trust)
@@ -228,8 +216,6 @@ def test_session_show_lists_first_the_session_a_start_continues(tmp_path: Path) 
     path = session_scene(tmp_path)
     learned = seed(path, DEMO_TABLE)
     seeded = last_kept(tmp_path / "right")
-    assert seeded is not None
-    assert learned is not None
     other = live_trust(session_scene(tmp_path / "other", "mlp")).state()
     with SessionFolder(tmp_path / "right") as folder:
         folder.load()

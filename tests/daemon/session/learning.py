@@ -85,8 +85,8 @@ def kept_in(folder: Path) -> list[KeptSession]:
     return [each for each in look(folder).values() if isinstance(each, KeptSession)]
 
 
-def last_kept(folder: Path) -> KeptSession | None:
-    return next(iter(kept_in(folder)), None)
+def last_kept(folder: Path) -> KeptSession:
+    return kept_in(folder)[0]
 
 
 def sensors(**serials: str) -> FakeDriver:
@@ -161,5 +161,5 @@ def sensor_watch(
 
 
 def kept_trust(folder: SessionFolder) -> TrustState | None:
-    kept = last_kept(folder.path)
-    return None if kept is None or kept.trust is None else kept.trust
+    found = kept_in(folder.path)
+    return found[0].trust if found else None
