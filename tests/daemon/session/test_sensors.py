@@ -32,7 +32,6 @@ from tests.daemon.session.learning import (
     INPUTS,
     calibration,
     judge,
-    kept_in,
     observe,
     read_once,
     sensor_watch,
@@ -121,27 +120,6 @@ def first_slips(robot: Robot, day: Day, number: int, grasps: int) -> list[Decisi
     verdicts = robot.see(day.stream(0, grasps))
     slips = (decision for slipped, decision, _ in verdicts if slipped)
     return list(itertools.islice(slips, number))
-
-
-@pytest.mark.parametrize("interruption", ["restart", "outage"])
-def test_an_exchange_without_serial_numbers_ends_the_session(
-    bts3_dir: Path, tmp_path: Path, interruption: str, caplog: pytest.LogCaptureFixture
-) -> None:
-    """If the session continued, 10 of the first 12 slips would be called stable."""
-    robot = Robot(tmp_path)
-    begin(Day("palm_45", bts3_dir), robot)
-    getattr(robot, interruption)()
-    with caplog.at_level(logging.WARNING):
-        slips = first_slips(robot, Day("palm_down", bts3_dir), 20, 60)
-    robot.stop()
-    assert len(slips) == 20
-    assert slips.count(Decision.STABLE) <= 2
-    assert "treated as other sensors" in caplog.text
-    kept, former = kept_in(tmp_path / "right")
-    assert former.statistics is not None
-    assert former.statistics.grasps >= 100
-    assert kept.statistics is not None
-    assert kept.statistics.grasps < 70
 
 
 def look(keeper: SessionKeeper, times: int = LOOK_EVERY) -> None:
@@ -318,9 +296,10 @@ def test_an_outage_and_a_restart_end_no_session(
             interrupt()
             assert all(calibrated for _, _, calibrated in robot.see(day.stream(2, 2)))
     assert "other sensors" not in caplog.text
-    robot.restart()
     other = Day("palm_down", bts3_dir)
-    assert not any(calibrated for _, _, calibrated in robot.see(other.stream(0, 2)))
-    robot.restart()
-    assert all(calibrated for _, _, calibrated in robot.see(day.stream(2, 2)))
+    for interrupt in (robot.restart, robot.outage):
+        interrupt()
+        assert not any(calibrated for _, _, calibrated in robot.see(other.stream(0, 2)))
+        robot.restart()
+        assert all(calibrated for _, _, calibrated in robot.see(day.stream(2, 2)))
     robot.stop()
