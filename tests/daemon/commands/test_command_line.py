@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from importlib.metadata import version
+from pathlib import Path
 
 import pytest
 import zmq
@@ -16,6 +17,7 @@ from graspd.daemon.cli import COMMANDS, LIBRARIES, whole_parser
 from tests.conftest import ROOT
 from tests.daemon.commands.shell_files import PAGE, manual, parsers
 from tests.kit.inside import graspd
+from tests.kit.programs import ran
 from tests.kit.terminal import Terminal
 
 EXTRAS = (
@@ -23,7 +25,7 @@ EXTRAS = (
     "rich", "distributed", "matplotlib", "keras", "mcap", "lz4", "zstandard", "foxglove",
 )  # fmt: skip
 """Packages that only extras bring."""
-LOOP = str(ROOT / "deploy/clients/loop.toml")
+LOOP = (ROOT / "deploy/clients/loop.toml").read_text()
 CORE_ONLY = f"""
 import sys
 
@@ -61,15 +63,17 @@ for words in {names!r}:
         (["evaluate", "--data", "absent"], "train"),
         (["report", "worth", "--data", "absent"], "train,report"),
         (["export-grasps", "absent.mcap", "--out", "absent.csv"], "record"),
-        (["run", LOOP], "record"),
-        (["check", LOOP], "record"),
+        (["run", "loop.toml"], "record"),
+        (["check", "loop.toml"], "record"),
     ],
 )
 def test_a_command_without_its_extra_says_how_to_install_it(
-    arguments: list[str], extra: str
+    arguments: list[str], extra: str, tmp_path: Path
 ) -> None:
+    own = LOOP.replace("../..", str(ROOT)).replace("/tmp/", f"{tmp_path}/")
+    (tmp_path / "loop.toml").write_text(own)
     code = f"{CORE_ONLY}\nsys.exit(main({arguments!r}))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    done = ran(sys.executable, "-c", code, cwd=tmp_path)
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
     assert f"run {sys.executable} -m pip install '.[{extra}]' in " in line
