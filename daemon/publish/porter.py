@@ -81,6 +81,10 @@ FAILED: Final = int(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FA
 """Events of failed handshakes; the second one if the peer hangs up first."""
 EVENT: Final = struct.Struct("=HI")
 """First frame of a monitor's message: event and value (zmq_socket_monitor(3))."""
+USER_IDS: Final = 2**32 - 1
+"""Number of user ids; a user namespace may have fewer (user_namespaces(7))."""
+OVERFLOW_ID: Final = 65534
+"""Linux' default of /proc/sys/kernel/overflowuid, which `ProcSubset=pid` hides."""
 PROBLEMS: Final = {
     0x11000001: "it takes another key for the daemon's",
     0x11000002: "it has no key",
@@ -147,6 +151,8 @@ class Courier(Proxy):
         `tcp://`; None: without keys."""
         super().__init__(endpoint, front, back)
         self._admission = admission
+        self._unknown_user = unknown_user()
+        self._is_warned = False
 
     def _copy(self) -> None:
         poller = zmq.Poller()
@@ -180,15 +186,39 @@ class Courier(Proxy):
         return True
 
     def _credential(self, frame: zmq.Frame) -> bytes:
-        """Return the sender: `user <uid>` by the kernel, `key <name>` by the handshake, or b""."""
+        """Return the sender: `user <uid>` by the kernel, `key <name>` by the handshake, or b"", as
+        for a user whom the kernel does not tell apart from others."""
         with suppress(zmq.ZMQError):  # libzmq knows nothing of the sender
             if self.endpoint.startswith("ipc://"):
                 _, *numbers = str(frame.get("Peer-Address")).rsplit(":", 3)  # uid, gid, pid
-                return b"user %d" % int(numbers[0]) if len(numbers) == 3 else b""
+                return self._user(int(numbers[0])) if len(numbers) == 3 else b""
             if self._admission is not None:  # without keys a peer may send any `User-Id`
                 key = str(frame.get("User-Id")).encode()
                 return b"key " + self._admission.admitted.get(key, "").encode()
         return b""
+
+    def _user(self, number: int) -> bytes:
+        if number != self._unknown_user:
+            return b"user %d" % number
+        if not self._is_warned:
+            what = "a peer's user has no id in this user namespace: [ask] tell cannot name it"
+            log.warning("%s: %s", self.endpoint, what)
+        self._is_warned = True
+        return b""
+
+
+def unknown_user() -> int | None:
+    """Return the user id that the kernel shows for all users that have none in the user namespace
+    of this process; None if all have one."""
+    try:
+        rows = Path("/proc/self/uid_map").read_text().splitlines()
+    except OSError:  # a kernel without user namespaces
+        return None
+    if sum(int(row.split()[2]) for row in rows) >= USER_IDS:
+        return None
+    with suppress(OSError):
+        return int(Path("/proc/sys/kernel/overflowuid").read_text())
+    return OVERFLOW_ID
 
 
 class Lookout(threading.Thread):

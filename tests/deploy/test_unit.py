@@ -88,6 +88,11 @@ def test_the_units_paths_restarts_and_commands_fit_the_daemon() -> None:
     assert before.endswith(" check /etc/graspd/%i.toml")
 
 
+def test_the_unit_tells_the_users_of_peers_apart() -> None:
+    # systemd.exec(5): PrivateUsers=yes shows all users but root and the unit's own as one.
+    assert settings(UNIT)["PrivateUsers"] == ["no"]
+
+
 def test_every_priority_that_a_scene_may_name_is_granted() -> None:
     (limit,) = settings(UNIT)["LimitRTPRIO"]
     assert Realtime(priority=int(limit)).priority == int(limit)

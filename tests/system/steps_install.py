@@ -88,12 +88,16 @@ def realtime(lab: Lab) -> Outcome:
 
 
 def access(lab: Lab) -> Outcome:
-    """Check that members of the group graspd may connect to the socket, and others may not."""
+    """Check that members of the group graspd may connect to the socket, and others may not; and
+    that the daemon sees who they are."""
     connect = "import socket, sys; socket.socket(socket.AF_UNIX).connect(sys.argv[1])"
     for user, error in ((MEMBER, ""), (STRANGER, "PermissionError")):
         done = lab.machine.run(f"runuser -u {user} -- {PYTHON} -c '{connect}' /run/graspd/can.ipc")
         if bool(done.code) is not bool(error) or error not in done.err:
             raise StepError(f"{user} connects with {done.code}: {done.err}")
+    users = lab.sh(f"cat /proc/{lab.show('can', 'MainPID')}/uid_map").split()
+    if users != ["0", "0", "4294967295"]:  # user_namespaces(7): each user as itself
+        raise StepError(f"users of peers are not told apart: {users}")
     return Outcome("a member of the group graspd may subscribe, a stranger gets EACCES")
 
 

@@ -95,6 +95,31 @@ def test_another_user_with_the_same_routing_id_is_told_apart(door: tuple[Door, s
         owner.kill()
 
 
+IN_A_NAMESPACE = "#!/bin/sh\nexec unshare --user --map-root-user '%s' \"$@\"\n"
+"""Runs Python where root is the only user, and the kernel shows all others as 65534."""
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
+@pytest.mark.parametrize(("user", "credential"), [("0", b"user 0"), ("12345", b"")])
+def test_a_user_outside_the_namespace_has_no_credential(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, user: str, credential: bytes
+) -> None:
+    python, namespaced = sys.executable, tmp_path / "python"
+    namespaced.write_text(IN_A_NAMESPACE % python)
+    namespaced.chmod(0o755)
+    if subprocess.run([namespaced, "-c", ""], check=False, capture_output=True).returncode:
+        pytest.skip("no user namespaces here")
+    monkeypatch.setattr(sys, "executable", str(namespaced))
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder).chmod(0o755)
+        with opened_door(Path(folder), 0o666) as (opened, endpoint):
+            said = user, (GREETING + hello()).hex(), QUESTION.hex()
+            path = endpoint.removeprefix("ipc://")
+            with subprocess.Popen([python, "-I", "-c", CONNECTS_AS, path, *said]) as asker:
+                assert receive(opened) == [[NAME, credential, b"lift"]]
+                asker.kill()
+
+
 def may_lift(sockets: Sockets, credential: bytes) -> bool:
     assert sockets.questions is not None
     lifts = LiftBook()
