@@ -31,6 +31,8 @@ NOT_HEARD = frozenset(
     {Cause.INTERFACE_MISSING, Cause.INTERFACE_DOWN, Cause.LINK_DOWN, Cause.SILENT, Cause.BITRATE}
 )
 """Causes that the kernel's state of the CAN interface may explain."""
+PORTS_OF_ROOT = Path("/proc/sys/net/ipv4/ip_unprivileged_port_start")
+"""File with the first port that an ordinary user may listen on (ip(7)), for IPv6 too."""
 NO_DATA = TROUBLES[LinkCause.SILENT]
 HELD_BY_GRASPD = (
     "graspd itself runs: see graspd watch. To look from here, end it first "
@@ -70,6 +72,9 @@ def explained(finding: Finding, section: DriverSection) -> list[Finding]:
         case Device(kind=DeviceKind.UDP, name=source), Cause.PORT_HELD:
             number = Endpoint.parse(source).port
             return [_held(finding, computer.port_holders("udp", number))]
+        case Device(kind=DeviceKind.UDP, name=source), Cause.PORT_DENIED:
+            advice = _of_root(Endpoint.parse(source).port) or "See dmesg for what forbids it."
+            return [replace(finding, advice=advice)]
         case Device(kind=DeviceKind.UDP, name=source), Cause.SILENT if (
             finding.advice == NO_DATA.advice
         ):
@@ -244,6 +249,10 @@ def _of_port(name: str, address: str) -> Iterator[Finding]:
             probe.bind((host, int(port)))
         except OSError as problem:
             what = f"{name}: tcp://{address}: {problem.strerror}"
+            advice = _of_root(int(port))
+            if problem.errno == errno.EACCES and advice is not None:
+                yield Finding(Level.ERROR, what, Cause.SOCKET_DENIED, advice)
+                return
             if problem.errno != errno.EADDRINUSE:
                 advice = "Name an address of this computer: ip -brief address lists them."
                 yield Finding(Level.ERROR, what, Cause.ADDRESS, advice)
@@ -251,6 +260,16 @@ def _of_port(name: str, address: str) -> Iterator[Finding]:
             advice = f"sudo ss -tlpn 'sport = {port}' names the program that has it."
             finding = Finding(Level.WARNING, what, Cause.SOCKET_HELD, advice)
             yield _held(finding, computer.port_holders("tcp", int(port)))
+
+
+def _of_root(port: int) -> str | None:
+    """Return advice if only root may listen on a port, else None."""
+    try:
+        first = int(PORTS_OF_ROOT.read_text())
+    except OSError:  # a kernel before 4.11
+        first = 1024
+    refused = f"Ports below {first} are root's: name a higher one than {port}."
+    return refused if port < first else None
 
 
 def _of_group(name: str, group: str | None) -> Iterator[Finding]:

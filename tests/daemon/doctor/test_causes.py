@@ -19,7 +19,7 @@ from types import SimpleNamespace
 import pytest
 
 from graspd.daemon.commands import doctor
-from graspd.daemon.doctor import computer
+from graspd.daemon.doctor import computer, surroundings
 from graspd.daemon.doctor.electrodes import ElectrodeStatistics
 from graspd.daemon.doctor.finding import Cause, Level
 from graspd.daemon.doctor.surroundings import can_finding
@@ -212,6 +212,27 @@ def test_a_tcp_endpoint_that_cannot_be_bound_is_reported(
     mine = [finding for finding in told if not finding["what"].startswith("spi: ")]
     assert [finding["cause"] for finding in mine if finding["cause"] != "keys"] == [cause]
     assert (f"PID {pid}, " in mine[0]["what"]) == (cause == "socket-held")
+
+
+@pytest.mark.parametrize(
+    ("text", "cause"),
+    [
+        ('[tactile]\ndriver = "palm"\nsource = "udp://127.0.0.1:872"\n', "port-denied"),
+        ('[publish]\nendpoint = "tcp://127.0.0.1:557"\n', "socket-denied"),
+        ('[publish]\nendpoint = "tcp://[::1]:557"\n', "socket-denied"),
+    ],
+)
+def test_a_port_that_only_root_may_use_is_reported(
+    text: str, cause: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, healthy: str
+) -> None:
+    ports = tmp_path / "ip_unprivileged_port_start"
+    ports.write_text("1000\n")  # ip(7): below it a port needs CAP_NET_BIND_SERVICE
+    monkeypatch.setattr(surroundings, "PORTS_OF_ROOT", ports)
+    monkeypatch.setattr("socket.socket.bind", refused(errno.EACCES))
+    told = look(tmp_path, text if "tactile" in text else healthy + text)
+    (mine,) = (finding for finding in told if finding["cause"] == cause)
+    assert mine["advice"].startswith("Ports below 1000 are root's: name a higher one")
+    assert "address" not in {finding["cause"] for finding in told}
 
 
 SURROUNDINGS: dict[str, tuple[str, str, str]] = {
