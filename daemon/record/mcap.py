@@ -6,6 +6,7 @@ import contextlib
 import os
 import re
 from collections.abc import Iterator, Mapping
+from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any, Final, Self
@@ -162,8 +163,8 @@ class McapWriter(RecordingFile):
         super().close()
 
 
-def make_room(options: Record, hand: str) -> int:
-    """Delete the hand's oldest recordings until another file fits; return their number.
+def make_room(options: Record, hand: str, stamp: str) -> int:
+    """Delete the hand's oldest recordings until the file with `stamp` fits; return their number.
 
     The link log of a recording is deleted with it. Raises `OSError`.
     """
@@ -172,7 +173,7 @@ def make_room(options: Record, hand: str) -> int:
     total_bytes = rotate_bytes(options) + sum(size for _, size in recordings.values())
     removed = 0
     while recordings and (len(recordings) >= FILES_MAX or total_bytes > options.keep_mb * 1e6):
-        paths, size = recordings.pop(min(recordings))
+        paths, size = recordings.pop(min(recordings, key=partial(_place, stamp)))
         for path in paths:
             path.unlink(missing_ok=True)
         total_bytes -= size
@@ -183,6 +184,17 @@ def make_room(options: Record, hand: str) -> int:
 def rotate_bytes(options: Record) -> float:
     """Return the size of files at which new ones begin, bytes."""
     return min(ROTATE_BYTES, options.keep_mb * 1e6 / 4)
+
+
+def _place(newest: str, stamp: str) -> tuple[bool, int, bool, str]:
+    """Return the place of a recording among those before `newest`; the oldest has the least.
+
+    The files of a run are the newest, by number. Others with a later time are the oldest: since
+    then the clock was set back.
+    """
+    _, run, number = stamp.split("-")
+    is_own = run == newest.split("-")[1]
+    return is_own, int(number) if is_own else 0, stamp < newest, stamp
 
 
 def _recordings(folder: Path, hand: str) -> dict[str, tuple[list[Path], int]]:

@@ -248,12 +248,12 @@ class Recorder(Companion):
         offset_ns = self._wall_clock() - now_ns
         header = replace(header, file=self._number, wall_minus_monotonic_ns=offset_ns)
         # Names sort by time.
-        stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
-        name = f"{self._hand}-{stamp}-{self._boot_id[:8]}-{self._number:04}"
-        path = self._options.folder / f"{name}.mcap"
+        began = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
+        stamp = f"{began}-{self._boot_id[:8]}-{self._number:04}"
+        path = self._options.folder / f"{self._hand}-{stamp}.mcap"
         files: list[RecordingFile] = []
         try:
-            self._counted["removed"] += make_room(self._options, self._hand)
+            self._counted["removed"] += make_room(self._options, self._hand, stamp)
             files.append(McapWriter(path, header))
             if self._tap is not None:
                 files.append(RecordingFile(path.with_suffix(self._tap.ending)))

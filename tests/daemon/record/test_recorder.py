@@ -92,6 +92,10 @@ def test_new_files_begin_by_size_without_losing_entries(
     assert numbers(tmp_path) == list(range(300))
 
 
+STAMP = f"20260101T000000Z-{BOOT[:8]}-0002"
+"""Stamp of the file for which old ones make room."""
+
+
 def old(folder: Path, hour: int, size: int, ending: str = "mcap") -> Path:
     path = folder / f"right-20200101T{hour:02}0000Z-00000000-0000.{ending}"
     path.parent.mkdir(exist_ok=True)
@@ -109,7 +113,7 @@ def test_the_oldest_files_make_room_and_nothing_else_is_removed(
     strangers = [folder / "right-notes.mcap", folder / "left-20200101T000000Z-00000000-0000.mcap"]
     for path in strangers:
         path.write_bytes(b"")
-    assert make_room(Record(directory=folder), "right") == 2
+    assert make_room(Record(directory=folder), "right", STAMP) == 2
     assert not paths[0].exists()
     assert not beside.exists()
     assert not paths[1].exists()
@@ -121,7 +125,26 @@ def test_old_files_are_deleted_until_all_fit_in_keep_mb(tmp_path: Path) -> None:
         old(tmp_path, hour, 10**6)
     for keep_mb, removed in ((4.5, 2), (1.0, 3), (1.0, 0)):
         options = Record(directory=tmp_path, keep_mb=keep_mb)
-        assert make_room(options, "right") == removed
+        assert make_room(options, "right", STAMP) == removed
+
+
+def test_after_the_clock_is_set_back_older_files_go_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = [
+        "20400101T000000Z-11111111-0000",
+        "20400101T010000Z-11111111-0001",  # then the clock is set back
+        "20250101T000000Z-22222222-0000",
+        "20260101T000000Z-01234567-0000",
+        "20250101T120000Z-01234567-0001",  # set back in the run of `STAMP`
+    ]
+    for stamp in made:
+        (tmp_path / f"right-{stamp}.mcap").touch()
+    for left in range(len(made), 0, -1):
+        monkeypatch.setattr(mcap, "FILES_MAX", left)
+        assert make_room(Record(directory=tmp_path), "right", STAMP) == 1
+        there = {path.stem.removeprefix("right-") for path in tmp_path.iterdir()}
+        assert there == set(made[len(made) - left + 1 :])
 
 
 @pytest.fixture
