@@ -25,6 +25,7 @@ from graspd.daemon.doctor.link import counter_findings, device_findings, rate_fi
 from graspd.daemon.doctor.surroundings import (
     can_finding,
     explained,
+    folder_findings,
     key_findings,
     model_finding,
     realtime_findings,
@@ -174,7 +175,8 @@ def _scene(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> list
     advised = {finding.advice for finding in findings if finding.advice}
     # A graspd that holds the port also holds the sockets. One finding is enough.
     sockets = [finding for finding in socket_findings(wanted) if finding.advice not in advised]
-    return [*findings, *key_findings(wanted), *sockets, *realtime_findings(wanted)]
+    kept = folder_findings(wanted)
+    return [*findings, *key_findings(wanted), *sockets, *kept, *realtime_findings(wanted)]
 
 
 def _listen(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> list[Finding]:

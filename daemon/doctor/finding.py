@@ -73,6 +73,8 @@ class Cause(StrEnum):
     SOCKET_HELD = "socket-held"
     SOCKET_GROUP = "socket-group"
     SOCKET_USER = "socket-user"
+    FOLDER = "folder"
+    """The session or the recordings cannot be written."""
     REALTIME = "realtime"
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import socket
+import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -136,6 +137,27 @@ def socket_findings(wanted: Scene) -> list[Finding]:
         for finding in told:
             by_cause.setdefault(finding.cause, finding)
     return list(by_cause.values())
+
+
+def folder_findings(wanted: Scene) -> list[Finding]:
+    """Try the folders of the session and of the recordings; return a warning for each that cannot
+    be made or written."""
+    folders = {"[session] folder": wanted.session_path} if wanted.keeps_session else {}
+    if wanted.record is not None:
+        folders["[record] directory"] = wanted.record.folder
+    findings = []
+    for key, path in folders.items():
+        there = next(folder for folder in (path, *path.parents) if os.path.exists(folder))
+        try:
+            if key == "[session] folder" and there not in (path, path.parent):
+                there = path.parent  # the daemon makes the last folder alone
+            with tempfile.TemporaryDirectory(prefix=".graspd-", dir=there):
+                pass
+        except OSError as problem:
+            what = f"{path}: nothing can be kept there: {problem.strerror}"
+            advice = f"Name another {key}, or make it: sudo install -d -o $USER {path}"
+            findings.append(Finding(Level.WARNING, what, Cause.FOLDER, advice))
+    return findings
 
 
 def key_findings(wanted: Scene) -> list[Finding]:

@@ -169,11 +169,14 @@ def refused(number: int) -> Callable[..., object]:
 
 
 def scene_of(folder: Path, text: str) -> Path:
-    """Write a scene of `text`, with a model and a socket if it has none; return its path."""
+    """Write a scene of `text`, with a model, a socket and no session unless it has these; return
+    its path."""
     if "[model]" not in text:
         text += '[model]\nname = "cnn1"\n'
     if "[publish]" not in text:
         text += f'[publish]\nendpoint = "ipc://{folder}/graspd"\n'
+    if "[session]" not in text:
+        text += "[session]\nkeep = false\n"
     return written(folder, text)
 
 

@@ -260,6 +260,18 @@ SURROUNDINGS: dict[str, tuple[str, str, str]] = {
         "keys",
         "graspd keys list --dir {folder}",
     ),
+    "folder of the session": (
+        '[publish]\nendpoint = "ipc://{folder}/graspd"\n'
+        '[session]\nkeep = true\nfolder = "/proc/nowhere.session"\n',
+        "folder",
+        "[session] folder",
+    ),
+    "folder of the recordings": (
+        '[publish]\nendpoint = "ipc://{folder}/graspd"\n'
+        '[record]\ndirectory = "{folder}/scene.toml/in"\n',
+        "folder",
+        "[record] directory",
+    ),
     "no such user": (
         '[publish]\nendpoint = "ipc://{folder}/graspd"\n'
         '[ask]\nendpoint = "ipc://{folder}/ask"\ntell = ["root", "nonesuch"]\n',
