@@ -73,7 +73,7 @@ class RiskReport(msgspec.Struct, frozen=True):
     announced: Count = 0
     """`lift` questions that were answered `stable`, one a grasp."""
     awaited: Count = 0
-    """Announced lifts without an outcome yet. From `[risk] outstanding_max` nothing is `stable`."""
+    """Announced lifts without an outcome yet. At `[risk] outstanding_max` no other is `stable`."""
 
 
 class Verdict(_Message, frozen=True, kw_only=True):

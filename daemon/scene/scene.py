@@ -99,7 +99,7 @@ class RiskSection(Section):
     explore: Annotated[float, Field(ge=0.0, le=1.0), unit()] = 0.05
     """Share of the grasps that are not `stable` to lift supervised after that."""
     outstanding_max: Annotated[int, Field(ge=1, le=100), unit("lifts")] = 5
-    """Number of announced lifts without outcome from which no grasp is `stable`."""
+    """Number of announced lifts without outcome from which no other grasp is `stable`."""
 
 
 class Learn(Section):

@@ -149,6 +149,11 @@ class LiftBook:
         lift = self._lifts.get(grasp)
         return lift is not None and lift.stable
 
+    def awaited_besides(self, grasp: GraspId) -> int:
+        """Return the number of announced lifts without an outcome, of other grasps than this."""
+        lift = self._lifts.get(grasp)
+        return self.awaited - (lift is not None and lift.is_awaited)
+
     def note(self, grasp: GraspId, features: bytes, *, stable: bool) -> bool:
         """Enter how a grasp was judged, and by which features (float64).
 

@@ -94,7 +94,7 @@ class Trust:
         `p_slip`, `margin`, `inputs`: probability and log-odds of slip by the network, its inputs.
         Raises `ValueError` for values that no network gives.
         """
-        awaited = self.lifts.awaited
+        awaited = self.lifts.awaited_besides(grasp)
         return assess(self._judging, self.risk, p_slip, margin, inputs, name=grasp, awaited=awaited)
 
     def review(self, grasp: GraspId, former: Assessment | None) -> Assessment:
@@ -107,7 +107,7 @@ class Trust:
             return Assessment(self._judging.outcomes)
         if former.permission is not Permission.ALLOWED or self.lifts.is_stable(grasp):
             return former
-        permission = self.risk.decide(former.log_odds, self.lifts.awaited)
+        permission = self.risk.decide(former.log_odds, self.lifts.awaited_besides(grasp))
         return former if permission is former.permission else replace(former, permission=permission)
 
     def note(self, grasp: GraspId, assessment: Assessment, *, stable: bool) -> None:

@@ -39,8 +39,8 @@ def assess(
     """Assess a grasp by the model's `p_slip`, its log-odds `margin`, and its flat `inputs`.
 
     `name`: id of the grasp, which decides by a hash if it is supervised. `awaited`: announced lifts
-    whose outcome can still come. Raises `ValueError` for values that are not finite or of another
-    shape; such a grasp must be `unknown`.
+    of other grasps whose outcome can still come. Raises `ValueError` for values that are not finite
+    or of another shape; such a grasp must be `unknown`.
     """
     if not 0.0 <= p_slip <= 1.0:  # also true for NaN
         raise ValueError(f"{p_slip} is not a probability")

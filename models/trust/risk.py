@@ -105,8 +105,8 @@ class Risk:
     4. `stable` is said only while b >= 1 - a. If each outcome is told before the next `stable`,
        a slip leaves b >= 0. This gives the first two bounds.
     5. Let m announced lifts be out. w = b - m (1 - a) is what is left of b if all of them slip.
-    6. An announced grasp was called `stable` at b >= 1 - a and m < M. Hence w >= -(M - 1) (1 - a)
-       after its announcement.
+    6. An announced grasp was called `stable` at b >= 1 - a and m < M, itself not counted in m.
+       Hence w >= -(M - 1) (1 - a) after its announcement.
     7. An outcome of an announced lift does not lower w: a slip takes 1 - a from b and 1 from m. The
        cap leaves b >= BUDGET_START, and m <= M. An exchange may lower b further; that only makes
        `stable` rarer, so the bounds with the higher b still hold.
@@ -178,7 +178,7 @@ class Risk:
     def decide(self, log_odds: float, awaited: int = 0) -> Permission:
         """Return whether a grasp with these log-odds of slip may be called `stable`.
 
-        `awaited`: announced lifts without an outcome.
+        `awaited`: announced lifts of other grasps without an outcome.
         """
         threshold = self.threshold
         if threshold == math.inf:

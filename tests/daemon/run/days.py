@@ -142,7 +142,9 @@ class Watch(Companion):
             return
         if verdict.risk.bound is None or verdict.risk.slips > verdict.risk.bound:
             yield "slips within the bound"
-        if verdict.judged and verdict.risk.awaited >= limits.outstanding_max:
+        lifts = published.lifts.state().records
+        others = [lift for lift in lifts if lift.is_awaited and lift.id != published.grasp]
+        if verdict.judged and len(others) >= limits.outstanding_max:
             yield "outcomes of the lifts before"
 
     def after_round(self) -> None:

@@ -75,6 +75,21 @@ def test_a_review_without_new_outcomes_keeps_the_permission(permission: Permissi
     assert part.review(named(1), former).permission is permission
 
 
+def test_an_announced_lift_is_not_counted_against_itself() -> None:
+    part = trust(RiskLimits(0.1, outstanding_max=2))
+    for number in (0, 1):
+        assert judge(part, number)
+        part.lifts.announce()
+        assert judge(part, number)
+    assert not judge(part, 2)
+    part.outcome(named(1), slipped=False)
+    assert judge(part, 2)
+    former = part.judge(named(3), 1e-6, -13.8, inputs(3))
+    assert part.review(named(3), former).permission is Permission.ALLOWED
+    part.lifts.announce()
+    assert part.review(named(3), former).permission is Permission.UNPROVEN
+
+
 @pytest.mark.parametrize(
     ("p", "margin", "says"),
     [
