@@ -17,14 +17,14 @@ from graspd.daemon.judge.reasons import Decision, Reason
 from graspd.daemon.publish.companion import KEPT, PublishedVerdict, Reply, Requests, Told
 from graspd.daemon.publish.messages import OBJECT_PATTERN, Owner, encode, withheld
 from graspd.daemon.publish.porter import Frames
-from graspd.daemon.trust.lift_book import NAME_BYTES, GraspId, LiftBook, Peer, Report
+from graspd.daemon.trust.lift_book import LIFTS_MAX, NAME_BYTES, GraspId, LiftBook, Peer, Report
 
 log = logging.getLogger("graspd")
 
 JUDGE, LIFT = b"judge", b"lift"
 """Texts that ask for a verdict. `lift` also reserves the grasp's outcome for the peer."""
 NOT_LIFTING = b"not-lifting"
-"""Text that takes back the last `lift` of this connection, answered or not."""
+"""Text that takes back the last `lift` of this connection, answered or not; no earlier one."""
 CLOCK = b"clock"
 """Text that asks for the daemon's monotonic time, to compare with a remote client's clock."""
 OUTCOME = b"outcome"
@@ -81,6 +81,9 @@ class Questions:
         self.waiting: dict[Peer, Question] = {}
         """Questions without an answer; the oldest first."""
         self._last: PublishedVerdict | None = None
+        self._last_lifts: dict[Peer, GraspId | None] = {}
+        """Grasp that the last `lift` of a connection offered; None: it was no offer. Only of those
+        with an open lift; the oldest first, `LIFTS_MAX` at most."""
 
     def serve(self, messages: Iterable[Frames], now_ns: int, requests: Requests) -> int | None:
         """Handle messages that arrived by `now_ns`; answer questions that are due by then.
@@ -121,7 +124,8 @@ class Questions:
 
     def _wait(self, peer: Peer, question: Question) -> None:
         if peer in self.waiting:
-            self._withdraw(peer, self.waiting.pop(peer))
+            self._withdraw(peer, self.waiting[peer])
+            self._end(peer)
             self.counters["given_up"] += 1
         elif len(self.waiting) >= WAITING_MAX:
             self._give_up(next(iter(self.waiting)), Reason.NOT_ASKED)
@@ -129,11 +133,26 @@ class Questions:
 
     def _give_up(self, peer: Peer, reason: Reason) -> None:
         """Answer the peer's question `unknown`, for `reason`; before any verdict only drop it."""
-        question = self.waiting.pop(peer)
+        question = self.waiting[peer]
         self._withdraw(peer, question)
+        self._end(peer)
         self.counters["given_up"] += 1
         if self._last is not None:
             self._answer(question.envelope, withheld(self._last.verdict, reason))
+
+    def _end(self, peer: Peer) -> None:
+        """Let the peer's question wait no more; if it is a `lift`, remember what it offered."""
+        question = self.waiting.pop(peer)
+        if not question.lifts or self._last is None:
+            return
+        self._last_lifts.pop(peer, None)
+        if self._last.lifts.offered(peer) is not None:
+            self._remember(peer, None if question.offer is None else question.offer[0])
+
+    def _remember(self, peer: Peer, offered: GraspId | None) -> None:
+        self._last_lifts[peer] = offered
+        if len(self._last_lifts) > LIFTS_MAX:
+            del self._last_lifts[next(iter(self._last_lifts))]
 
     def _withdraw(self, peer: Peer, question: Question) -> None:
         """Clear the offer of a question, if it has one: the peer no longer owns that grasp."""
@@ -144,11 +163,14 @@ class Questions:
 
     def _take_back(self, envelope: Frames, peer: Peer, requests: Requests) -> None:
         answer = partial(self._answer_outcome, envelope)
-        self.waiting.pop(peer, None)
+        if peer in self.waiting:
+            self._end(peer)
         grasp = None if self._last is None else self._last.lifts.offered(peer)
-        if grasp is None:
+        # A connection that has not asked since the start may take back what it owns from before.
+        if grasp is None or grasp != self._last_lifts.get(peer, grasp):
             answer(KEPT)
         else:
+            self._remember(peer, grasp)
             requests.outcome(Report(grasp, "not-lifted", peer=peer), answer)
 
     def _take_outcome(self, envelope: Frames, peer: Peer, text: bytes, requests: Requests) -> None:
@@ -199,7 +221,7 @@ class Questions:
             if now_ns is None or question.offer or question.due_ns <= now_ns:
                 payload = self._payload(peer, question, published)
                 if payload is not None:
-                    del self.waiting[peer]
+                    self._end(peer)
                     self.counters["answered"] += 1
                     self._answer(question.envelope, payload)
 

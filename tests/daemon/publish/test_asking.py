@@ -64,21 +64,30 @@ class Model:
         self.tells = tells
         self.book = LiftBook()
         self.waiting: dict[Peer, Waiting] = {}  # oldest first
+        self.lasts: dict[Peer, int | None] = {}  # grasp of the last `lift`, if it was an offer
         self.said: list[Said] = []
 
     def ask(self, peer: Peer, envelope: Frames, now_ns: int, *, lifts: bool) -> None:
         """Take in a question. Keep only a connection's newest; answer the oldest `unknown` if
         a fourth peer asks. `lifts`: asks if it may lift; else for a judgement."""
         if peer in self.waiting:
-            self.withdraw(peer, self.waiting.pop(peer))
+            self.withdraw(peer, self.waiting[peer])
+            self.end(peer, self.waiting[peer])
         elif len(self.waiting) == MOST:
             self.give_up(next(iter(self.waiting)), "not-asked")
         self.waiting[peer] = Waiting(envelope, lifts, now_ns + S)
 
     def give_up(self, peer: Peer, reason: str) -> None:
-        question = self.waiting.pop(peer)
+        question = self.waiting[peer]
         self.withdraw(peer, question)
+        self.end(peer, question)
         self.said.append((question.envelope, ("unknown", [reason])))
+
+    def end(self, peer: Peer, question: Waiting) -> None:
+        """Let a question wait no more; note what it offers if it is a `lift`."""
+        del self.waiting[peer]
+        if question.lifts:
+            self.lasts[peer] = question.offer[0] if question.offer else None
 
     def withdraw(self, peer: Peer, question: Waiting) -> None:
         """Take back the offer of a lift that a question has; the grasp then has no owner."""
@@ -93,7 +102,7 @@ class Model:
             if now_ns is None or question.offer or question.due_ns <= now_ns:
                 answer = self.answer(peer, question, grasp, name, supervised=supervised)
                 if answer is not None:
-                    del self.waiting[peer]
+                    self.end(peer, question)
                     self.said.append((question.envelope, answer))
 
     def answer(
@@ -245,10 +254,13 @@ class Questioning(RuleBasedStateMachine):
     @rule(peer=ANYONE)
     def take_back(self, peer: Peer) -> None:
         self.take(peer, b"not-lifting", [])
-        self.model.waiting.pop(peer, None)
-        grasp = self.model.book.offered(peer)
-        ok = grasp is None or take(self.model.book, Report(grasp, "not-lifted", peer=peer))
-        self.model.said.append(([peer.routing_id], ok))
+        if peer in self.model.waiting:
+            self.model.end(peer, self.model.waiting[peer])
+        last = self.model.lasts.get(peer)
+        owned = self.model.book.offered(peer)
+        if owned is not None and owned.grasp == last:
+            take(self.model.book, Report(owned, "not-lifted", peer=peer))
+        self.model.said.append(([peer.routing_id], True))
 
     @rule(peer=ANYONE, outcome=OUTCOMES, back=st.sampled_from((0, 0, 1, 2)))
     def tell(self, peer: Peer, outcome: str, back: int) -> None:

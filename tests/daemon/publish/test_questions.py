@@ -15,7 +15,7 @@ from graspd.daemon.publish.companion import KEPT, Answer, Reply, Told
 from graspd.daemon.publish.messages import OutcomeMessage, decode_outcome, schema
 from graspd.daemon.publish.outbox import Outbox
 from graspd.daemon.publish.questions import Questions
-from graspd.daemon.trust.lift_book import GraspId, Peer, Report
+from graspd.daemon.trust.lift_book import GraspId, LiftBook, Peer, Report
 from tests.daemon.fakes import FINGERS, Clock
 from tests.daemon.publish.doors import USER, published
 from tests.daemon.publish.doors import Asked as Requests
@@ -135,6 +135,42 @@ def test_a_question_due_before_the_first_reading_publishes_silence(
     asked.questions.take([[b"asker", USER, b"judge"]], 0, requests)
     asked.questions.serve([], 10**9, requests)
     assert silences == [True]
+
+
+@pytest.mark.parametrize(
+    ("answers", "restarts", "left"),
+    [
+        (["stable"], False, []),
+        (["stable", "stable"], False, [1]),
+        (["stable", "slip"], False, [1]),
+        (["stable", "told"], False, [1]),
+        (["stable", "stable"], True, [1]),
+    ],
+)
+def test_not_lifting_takes_back_only_the_last_lift(
+    asked: Asked, answers: list[str], restarts: bool, left: list[int]
+) -> None:
+    """The answers are to a `lift` of grasp 1, then 2; `told`: `stable`, and its outcome is told."""
+    requests, book = Requests(), LiftBook()
+    peer = [TELLER.ljust(16), USER]
+    for number, name in enumerate(answers, 1):
+        grasp, name = GraspId("0" * 32, number), name.replace("told", "stable")
+        book.note(grasp, bytes(8), stable=name == "stable")
+        asked.questions.take([[*peer, b"lift"]], 0, requests)
+        asked.questions.answer(published(b"{}", name, book, grasp=number))
+        asked.questions.answer(published(b"{}", name, book, grasp=number))
+        if answers[number - 1] == "told":
+            book.tell(grasp, slipped=False)
+    if restarts:
+        asked = Asked()
+        asked.questions.answer(published(lifts=book))
+    for _ in range(2):  # the second has nothing to take back
+        asked.questions.take([[*peer, b"not-lifting"]], 0, requests)
+        for report in requests.outcomes:
+            assert report.outcome == "not-lifted"
+            book.take_back(report.grasp)
+    assert [lift.id.grasp for lift in book.state().records if lift.is_awaited] == left
+    assert json.loads(asked.sent[-1][-1]) == {"v": 1, "ok": True}
 
 
 SLIP, STABLE = (f"outcome {BOOT} 7 {how}".encode() for how in ("slip", "stable"))
