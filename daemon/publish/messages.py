@@ -297,9 +297,9 @@ encode = msgspec.json.Encoder().encode
 """Return the JSON payload of a message."""
 
 
-def withheld(verdict: Verdict, reason: Reason) -> bytes:
-    """Return the JSON of a verdict, changed to `unknown` for this reason, and not `supervised`."""
-    unsure = replace(verdict, verdict=Decision.UNKNOWN, verdict_code=0, reasons=[reason])
+def withheld(verdict: Verdict, *reasons: Reason) -> bytes:
+    """Return the JSON of a verdict, changed to `unknown` for these reasons, not `supervised`."""
+    unsure = replace(verdict, verdict=Decision.UNKNOWN, verdict_code=0, reasons=[*reasons])
     without = replace(unsure, p_slip=None, p_slip_model=None, valid=False, judged=False)
     return encode(replace(without, supervised=False, early=False))
 

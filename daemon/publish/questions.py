@@ -131,14 +131,14 @@ class Questions:
             self._give_up(next(iter(self.waiting)), Reason.NOT_ASKED)
         self.waiting[peer] = question
 
-    def _give_up(self, peer: Peer, reason: Reason) -> None:
-        """Answer the peer's question `unknown`, for `reason`; before any verdict only drop it."""
+    def _give_up(self, peer: Peer, *reasons: Reason) -> None:
+        """Answer the peer's question `unknown`, for `reasons`; before any verdict only drop it."""
         question = self.waiting[peer]
         self._withdraw(peer, question)
         self._end(peer)
         self.counters["given_up"] += 1
         if self._last is not None:
-            self._answer(question.envelope, withheld(self._last.verdict, reason))
+            self._answer(question.envelope, withheld(self._last.verdict, *reasons))
 
     def _end(self, peer: Peer) -> None:
         """Let the peer's question wait no more; if it is a `lift`, remember what it offered."""
@@ -202,14 +202,23 @@ class Questions:
         self.counters["dropped"] += not self._send((*envelope, payload))
 
     def _expire(self, now_ns: int, requests: Requests) -> None:
-        """Answer `unknown` to questions that are due, though no reading has come."""
+        """Answer `unknown` to questions that are due, though nothing was judged for them."""
         due = [peer for peer, question in self.waiting.items() if question.due_ns <= now_ns]
         if due and self._last is None:
             requests.silence()
         for peer in due:
             if peer in self.waiting:
-                reason = Reason.NOT_KEPT if self.waiting[peer].offer else Reason.STALE
-                self._give_up(peer, reason)
+                offer = self.waiting[peer].offer
+                self._give_up(peer, *([Reason.NOT_KEPT] if offer else self._why_not(now_ns)))
+
+    def _why_not(self, now_ns: int) -> list[Reason]:
+        """Return why nothing was judged: the last verdict's reasons, or `stale` if it has none, if
+        it reports silence, or if its reading is so old that it is silence by now."""
+        if self._last is not None and self._last.reading is not None:
+            verdict = self._last.verdict
+            if verdict.reasons and now_ns - verdict.t_mono_ns <= verdict.silence_ms * 1e6:
+                return verdict.reasons
+        return [Reason.STALE]
 
     def answer(self, published: PublishedVerdict, now_ns: int | None = None) -> None:
         """Answer waiting questions with this verdict.

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
@@ -22,6 +23,7 @@ from graspd.daemon.publish.companion import KEPT, Answer, Reply, Told
 from graspd.daemon.publish.porter import Frames
 from graspd.daemon.publish.questions import Questions
 from graspd.daemon.trust.lift_book import GraspId, LiftBook, Peer, Report
+from tests.daemon.fakes import sound
 from tests.daemon.publish.doors import Asked, published
 
 MOST = 3
@@ -37,6 +39,7 @@ PEERS = [
     Peer(b"fifteen-bytes..", ROBOT),
 ]
 ANYONE = st.sampled_from((*PEERS[:1] * 3, *PEERS))
+READING = sound(np.zeros((3, 24), np.uint16))
 OUTCOMES = st.sampled_from(("stable", "slip", "not-lifted"))
 Said = tuple[Frames, object]
 """Frames before an answer, and its content as `plain` returns it."""
@@ -63,6 +66,7 @@ class Model:
     def __init__(self, tells: Callable[[bytes], bool] | None) -> None:
         self.tells = tells
         self.book = LiftBook()
+        self.last = "", 0  # name and time of the last verdict
         self.waiting: dict[Peer, Waiting] = {}  # oldest first
         self.lasts: dict[Peer, int | None] = {}  # grasp of the last `lift`, if it was an offer
         self.said: list[Said] = []
@@ -77,11 +81,19 @@ class Model:
             self.give_up(next(iter(self.waiting)), "not-asked")
         self.waiting[peer] = Waiting(envelope, lifts, now_ns + S)
 
-    def give_up(self, peer: Peer, reason: str) -> None:
+    def give_up(self, peer: Peer, *reasons: str) -> None:
         question = self.waiting[peer]
         self.withdraw(peer, question)
         self.end(peer, question)
-        self.said.append((question.envelope, ("unknown", [reason])))
+        self.said.append((question.envelope, ("unknown", [*reasons])))
+
+    def overdue(self, question: Waiting, now_ns: int) -> list[str]:
+        """Return why a question that is due is answered `unknown`."""
+        name, judged_ns = self.last
+        if question.offer:
+            return ["not-kept"]
+        is_silent = now_ns - judged_ns > 100_000_000
+        return ["stale"] if is_silent or name != "unknown" else ["moving", "settling"]
 
     def end(self, peer: Peer, question: Waiting) -> None:
         """Let a question wait no more; note what it offers if it is a `lift`."""
@@ -214,8 +226,11 @@ class Questioning(RuleBasedStateMachine):
             waits.append,
             self.grasp,
             supervised=supervised,
+            reasons=["moving", "settling"] if name == "unknown" else [],
+            t_mono_ns=self.now_ns,
         )
-        self.questions.answer(verdict, now_ns)
+        self.model.last = name, self.now_ns
+        self.questions.answer(verdict._replace(reading=READING), now_ns)
         before = {peer: each.offer for peer, each in self.model.waiting.items()}
         self.model.verdict(self.grasp, name, now_ns, supervised=supervised)
         offered = [
@@ -251,6 +266,19 @@ class Questioning(RuleBasedStateMachine):
             self.the_disk_answers(ok, 1 if regrasps else 99)
             self.judge(name, supervised=True, is_new=False, is_answer=False)
 
+    @rule(
+        peer=ANYONE,
+        lifts=st.booleans(),
+        name=st.sampled_from(("stable", "slip", "unknown", "unknown")),
+        left_ns=st.sampled_from((1, S // 10, S // 10 + 1)),
+    )
+    def wait_in_vain(self, peer: Peer, lifts: bool, name: str, left_ns: int) -> None:
+        """Ask, and have a verdict that does not answer, `left_ns` before the answer is due."""
+        self.ask(peer, lifts=lifts, is_req=False)
+        self.wait(S - left_ns)
+        self.judge(name, supervised=False, is_new=False, is_answer=False)
+        self.wait(left_ns)
+
     @rule(peer=ANYONE)
     def take_back(self, peer: Peer) -> None:
         self.take(peer, b"not-lifting", [])
@@ -276,7 +304,7 @@ class Questioning(RuleBasedStateMachine):
         next_ns = self.questions.serve([], self.now_ns, self.loop)
         for peer, question in list(self.model.waiting.items()):
             if question.due_ns <= self.now_ns:
-                self.model.give_up(peer, "not-kept" if question.offer else "stale")
+                self.model.give_up(peer, *self.model.overdue(question, self.now_ns))
         assert next_ns == min((each.due_ns for each in self.model.waiting.values()), default=None)
 
     @invariant()

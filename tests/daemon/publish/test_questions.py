@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import jsonschema
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -16,7 +17,7 @@ from graspd.daemon.publish.messages import OutcomeMessage, decode_outcome, schem
 from graspd.daemon.publish.outbox import Outbox
 from graspd.daemon.publish.questions import Questions
 from graspd.daemon.trust.lift_book import GraspId, LiftBook, Peer, Report
-from tests.daemon.fakes import FINGERS, Clock
+from tests.daemon.fakes import FINGERS, Clock, sound
 from tests.daemon.publish.doors import USER, published
 from tests.daemon.publish.doors import Asked as Requests
 from tests.kit.loops import SentMessages
@@ -171,6 +172,34 @@ def test_not_lifting_takes_back_only_the_last_lift(
             book.take_back(report.grasp)
     assert [lift.id.grasp for lift in book.state().records if lift.is_awaited] == left
     assert json.loads(asked.sent[-1][-1]) == {"v": 1, "ok": True}
+
+
+@pytest.mark.parametrize(
+    ("name", "is_silence", "age_ms", "reasons"),
+    [
+        ("unknown", False, 0, ["parity", "no-contact"]),
+        ("unknown", False, 100, ["parity", "no-contact"]),
+        ("unknown", False, 101, ["stale"]),
+        ("unknown", True, 0, ["stale"]),
+        ("stable", False, 0, ["stale"]),
+        ("slip", False, 0, ["stale"]),
+    ],
+)
+def test_an_overdue_question_gets_the_last_reasons_until_silence(
+    asked: Asked, name: str, is_silence: bool, age_ms: int, reasons: list[str]
+) -> None:
+    """The golden verdicts tell that 100 ms are silence."""
+    requests, judged_ns = Requests(), 10**9 - age_ms * 10**6
+    last = ["parity", "no-contact"] if name == "unknown" else []
+    verdict = published(name=name, t_mono_ns=judged_ns, reasons=last)
+    asked.questions.take([[b"asker", USER, b"judge"]], 0, requests)
+    reading = None if is_silence else sound(np.zeros((3, 24), np.uint16), judged_ns)
+    asked.questions.answer(verdict._replace(reading=reading), judged_ns - 1)
+    assert asked.sent == []
+    asked.questions.serve([], 10**9, requests)
+    answer = json.loads(asked.sent[0][1])
+    assert (answer["verdict"], answer["reasons"]) == ("unknown", reasons)
+    assert (answer["p_slip"], answer["valid"], answer["judged"]) == (None, False, False)
 
 
 SLIP, STABLE = (f"outcome {BOOT} 7 {how}".encode() for how in ("slip", "stable"))
