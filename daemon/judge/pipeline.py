@@ -232,7 +232,7 @@ class Pipeline:
             self._keep_to_learn(examined, moment.grasp)
         stable = judgement.decision is Decision.STABLE
         if stable or moment.judges:
-            self._note(lift, worth, stable=stable)
+            self._note(lift, worth, stable=stable, judged=moment.judged)
         return judgement
 
     def silence(self, last_t_ns: int) -> Judgement:
@@ -298,11 +298,13 @@ class Pipeline:
             self._assessment = worth
         return worth, risk
 
-    def _note(self, grasp: GraspId, worth: Assessment | None, *, stable: bool) -> None:
+    def _note(
+        self, grasp: GraspId, worth: Assessment | None, *, stable: bool, judged: bool
+    ) -> None:
         if self.trust is None or worth is None:
-            self.lifts.note(grasp, NOT_ASSESSED, stable=stable)
+            self.lifts.note(grasp, NOT_ASSESSED, stable=stable, judged=judged)
         else:
-            self.trust.note(grasp, worth, stable=stable)
+            self.trust.note(grasp, worth, stable=stable, judged=judged)
 
     def _conclude(
         self,

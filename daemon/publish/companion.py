@@ -56,7 +56,7 @@ class LoopEvent(Enum):
     SKIPPED = "skipped"
     """Readings before the next one were skipped."""
     ANNOUNCED = "announced"
-    """A controller asked whether it may lift, and the answer was `stable`."""
+    """A controller asked whether it may lift, and the answer was `stable` or `supervised`."""
     TAKEN_BACK = "taken-back"
     """No lift follows the last announcement."""
 

@@ -248,8 +248,7 @@ class Questions:
         if is_new and not (self._may_lift(peer, lifts) and lifts.claim(published.grasp, peer)):
             early = verdict.early and not verdict.supervised
             return encode(replace(verdict, supervised=False, early=early, owner="another"))
-        if is_stable:
-            lifts.announce()
+        lifts.announce()
         if is_new:
             question.offer = offer
             published.keep(partial(question.keep, offer))

@@ -125,7 +125,7 @@ class Topic(StrEnum):
     SKIPPED = "skipped"
     """Readings before the next one were skipped."""
     ANNOUNCED = "announced"
-    """A controller asked if it may lift, and the answer was `stable`."""
+    """A controller asked if it may lift, and the answer was `stable` or `supervised`."""
     TAKEN_BACK = "taken-back"
     """No lift follows the last announcement."""
     # Made from these for viewers:

@@ -82,7 +82,7 @@ class Lift(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     slipped: bool | None = None
     """Outcome: True for a slip. None: not known yet."""
     announced: bool = False
-    """True once a `lift` question was answered `stable`."""
+    """True once a `lift` question was answered yes, and the grasp was called `stable`."""
     owner: Peer | None = None
     """First peer that was answered that it may lift the grasp; None: no peer yet."""
 
@@ -121,7 +121,12 @@ class LiftBook:
         self.lifter: Peer | None = None
         """Last peer that was answered that it may lift a grasp; None: none since the start."""
         self.on_announced: Callable[[bool], None] = lambda _announced: None
-        """Called with True after an announcement, with False after it was taken back."""
+        """Called with True after `announce` changed anything, with False after an announcement was
+        taken back. A recording has these calls, so that its replay learns the same."""
+        self._judged: tuple[GraspId, bytes] | None = None
+        """Grasp judged last, and its features when it was judged last after settling."""
+        self._offered: GraspId | None = None
+        """Grasp that was offered last; None: no grasp since the start."""
         self._unkept: set[GraspId] = set()
         """Grasps whose outcome was accepted and is not on the disk yet."""
         self.told: Counter[OutcomeStatus] = Counter()
@@ -154,20 +159,29 @@ class LiftBook:
         lift = self._lifts.get(grasp)
         return self.awaited - (lift is not None and lift.is_awaited)
 
-    def note(self, grasp: GraspId, features: bytes, *, stable: bool) -> bool:
-        """Enter how a grasp was judged, and by which features (float64).
+    def note(self, grasp: GraspId, features: bytes, *, stable: bool, judged: bool = False) -> bool:
+        """Enter how a grasp was judged, and by which features (float64). `judged`: as in `Moment`.
 
-        The first verdict counts, or the first that called the grasp `stable`: a controller lifts on
-        that one. A grasp that was not assessed is entered again once it is. Nothing changes after
-        the outcome is known. Return True if an announced lift left the book without an outcome.
+        The outcome teaches the features at the last offer (`announce`). Without an offer the daemon
+        does not know when the lift began. Then those of the first `stable` verdict count: who does
+        not ask lifts on that one, and later ones may be of an object in the air. If there is none,
+        those of the last judgement after settling count: the hand may have pressed harder before.
+        A grasp that was not assessed is entered again once it is. Nothing changes after the outcome
+        is known. Return True if an announced lift left the book without an outcome.
         """
         lift = self._lifts.get(grasp)
+        if judged and features != NOT_ASSESSED:
+            self._judged = grasp, features
         if lift is not None:
             first_stable = stable and not lift.stable
             first_assessed = lift.features == NOT_ASSESSED != features
-            if lift.slipped is not None or not (first_stable or first_assessed):
+            again = judged and not lift.stable and bool(lift.features and features)
+            if lift.slipped is not None or not (first_stable or first_assessed or again):
                 return False
             stable = stable or lift.stable
+        self._judged = grasp, features
+        if lift is not None and lift.features and grasp == self._offered:
+            features = lift.features
         former = lift or Lift(grasp, stable, features)
         self._lifts[grasp] = replace(former, stable=stable, features=features)
         is_counted, is_abandoned = stable, False
@@ -195,13 +209,25 @@ class LiftBook:
         return True
 
     def announce(self) -> None:
-        """Note, once, that a `lift` question about the newest grasp was answered `stable`."""
+        """Note that a `lift` question about the newest grasp was answered yes.
+
+        Its outcome teaches what was judged last after settling: the hand may have pressed harder
+        since the first judgement. It is announced, once, if it was ever called `stable`.
+        """
         lift = next(reversed(self._lifts.values()), None)
-        if lift is None or not lift.stable or lift.announced or lift.slipped is not None:
+        if lift is None or lift.slipped is not None:
             return
-        self._lifts[lift.id] = replace(lift, announced=True)
-        self.announced += 1
-        self._count()
+        features = lift.features
+        if features is not None and self._judged is not None and self._judged[0] == lift.id:
+            features = self._judged[1]
+        is_known = lift.id == self._offered and lift.stable == lift.announced
+        if is_known and features == lift.features:
+            return
+        self._offered = lift.id
+        self._lifts[lift.id] = replace(lift, features=features, announced=lift.stable)
+        if not lift.announced and lift.stable:
+            self.announced += 1
+            self._count()
         self.on_announced(True)
 
     def take_back(self, grasp: GraspId | None) -> bool:
@@ -281,6 +307,7 @@ class LiftBook:
     def exchanged(self) -> None:
         """Note that a sensor was exchanged: outcomes of the lifts until now teach nothing more."""
         self._lifts = {grasp: replace(lift, features=None) for grasp, lift in self._lifts.items()}
+        self._judged = None
 
     def state(self) -> LiftBookState:
         """Return what `restore` needs."""
@@ -298,6 +325,7 @@ class LiftBook:
             if lift.features is not None and lift.slipped is not None:
                 raise ValueError("would learn from a grasp twice")
         self._lifts = lifts
+        self._judged = self._offered = None
         self._unkept.clear()
         self.told = Counter(state.told)
         self.unreported, self.announced = state.unreported, state.announced

@@ -110,11 +110,14 @@ class Trust:
         permission = self.risk.decide(former.log_odds, self.lifts.awaited_besides(grasp))
         return former if permission is former.permission else replace(former, permission=permission)
 
-    def note(self, grasp: GraspId, assessment: Assessment, *, stable: bool) -> None:
-        """Enter a grasp's verdict in the book. Raises `ValueError` if `stable` is not allowed."""
+    def note(
+        self, grasp: GraspId, assessment: Assessment, *, stable: bool, judged: bool = False
+    ) -> None:
+        """Enter a grasp's verdict in the book, as `LiftBook.note` does. Raises `ValueError` if
+        `stable` is not allowed."""
         if stable and assessment.permission is not Permission.ALLOWED:
             raise ValueError(f"grasp {grasp.grasp} was called stable: {assessment.permission}")
-        if self.lifts.note(grasp, assessment.features, stable=stable):
+        if self.lifts.note(grasp, assessment.features, stable=stable, judged=judged):
             self.risk.take_untold()
 
     def outcome(self, grasp: GraspId, *, slipped: bool) -> OutcomeStatus:

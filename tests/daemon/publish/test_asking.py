@@ -129,8 +129,7 @@ class Model:
             if not (self.may_lift(peer) and self.book.claim(named(grasp), peer)):
                 return name, "another", False
             question.offer = offer
-        if name == "stable":
-            self.book.announce()
+        self.book.announce()
         if question.kept is False:
             self.withdraw(peer, question)
             return "unknown", ["not-kept"]

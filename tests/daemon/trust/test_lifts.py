@@ -62,14 +62,24 @@ class Model:
         self.announced = self.unreported = 0
         self.unkept: set[int] = set()
         self.lifter: Peer | None = None
+        self.newest = 0, b""  # grasp and features of the judgement that an offer is for
+        self.offered = 0  # grasp that was offered last
 
-    def judged(self, number: int, lesson: bytes, *, stable: bool) -> None:
-        """Enter a grasp: its first verdict counts, or the first `stable` one, or the first with
-        features. `lesson`: its features."""
-        lift = self.lifts.setdefault(number, Lift(stable, lesson))
-        is_better = (stable and not lift.stable) or (lift.lesson == NOT_ASSESSED != lesson)
-        if lift.slipped is None and is_better:
-            lift.stable, lift.lesson = lift.stable or stable, lesson
+    def judged(self, number: int, lesson: bytes, *, stable: bool, settles: bool) -> None:
+        """Enter a grasp by its features, `lesson`: those of its last offer count, else of its first
+        `stable` verdict, else of the last one that `settles`, else of the first that has any."""
+        if settles and lesson:
+            self.newest = number, lesson
+        lift = self.lifts.get(number)
+        if lift is None:
+            self.lifts[number], self.newest = Lift(stable, lesson), (number, lesson)
+        elif lift.slipped is None:
+            is_better = (stable and not lift.stable) or (lift.lesson == NOT_ASSESSED != lesson)
+            if is_better or (settles and not lift.stable and lift.lesson and lesson):
+                self.newest = number, lesson
+                lift.stable = lift.stable or stable
+                if number != self.offered or not lift.lesson:
+                    lift.lesson = lesson
         if len(self.lifts) > BOOK:
             oldest = min(self.lifts)
             lost = self.lifts.pop(oldest)
@@ -131,14 +141,14 @@ class Lifts(RuleBasedStateMachine):
         self.model.unkept.clear()
         self.disk = encode(self.part.state()), deepcopy(self.model), self.late
 
-    def say(self, number: int, margin: float) -> None:
+    def say(self, number: int, margin: float, *, settles: bool = True) -> None:
         worth = self.part.judge(named(number), sigmoid(margin), margin, inputs(number))
         stable = worth.permission is Permission.ALLOWED and (worth.p_slip or 0.0) < 0.5
         if stable and self.model.alpha is not None:
             assert self.model.budget >= 1.0 - self.model.alpha - 1e-9
             assert len({*self.model.awaited()} - {number}) < self.most
-        self.part.note(named(number), worth, stable=stable)
-        self.model.judged(number, worth.features, stable=stable)
+        self.part.note(named(number), worth, stable=stable, judged=settles)
+        self.model.judged(number, worth.features, stable=stable, settles=settles)
 
     @rule(margin=MARGINS, times=st.sampled_from((1, 1, 3)))
     def judge(self, margin: float, times: int = 1) -> None:
@@ -146,10 +156,10 @@ class Lifts(RuleBasedStateMachine):
             self.number += 1
             self.say(self.number, margin)
 
-    @rule(margin=MARGINS, back=BACK)
-    def judge_again(self, margin: float, back: int) -> None:
+    @rule(margin=MARGINS, back=BACK, settles=st.booleans())
+    def judge_again(self, margin: float, back: int, settles: bool) -> None:
         if self.number - back in self.model.lifts:
-            self.say(self.number - back, margin)
+            self.say(self.number - back, margin, settles=settles)
 
     @rule(stable=st.booleans(), margin=st.none() | MARGINS)
     def judge_what_cannot_be_assessed(self, stable: bool, margin: float | None) -> None:
@@ -157,7 +167,7 @@ class Lifts(RuleBasedStateMachine):
         stable = stable and self.model.alpha is None
         self.number += 1
         self.part.note(named(self.number), Assessment(0), stable=stable)
-        self.model.judged(self.number, NOT_ASSESSED, stable=stable)
+        self.model.judged(self.number, NOT_ASSESSED, stable=stable, settles=True)
         if margin is not None:
             self.say(self.number, margin)
 
@@ -174,10 +184,15 @@ class Lifts(RuleBasedStateMachine):
     def announce(self) -> None:
         self.part.lifts.announce()
         lift = self.model.lifts.get(self.number)
-        if lift is not None and lift.stable and lift.slipped is None and not lift.announced:
-            lift.announced = True
-            self.model.announced += 1
-            self.expected.append(True)
+        if lift is None or lift.slipped is not None:
+            return
+        before = self.model.offered, lift.lesson, lift.announced
+        self.model.offered = self.number
+        if lift.lesson is not None and self.model.newest[0] == self.number:
+            lift.lesson = self.model.newest[1]
+        lift.announced = lift.stable
+        self.model.announced += lift.announced - before[2]
+        self.expected += [True] * (before != (self.number, lift.lesson, lift.announced))
 
     @rule(back=st.none() | BACK)
     def take_back(self, back: int | None) -> None:
@@ -212,6 +227,7 @@ class Lifts(RuleBasedStateMachine):
         self.part.sensors_exchanged()
         model = self.model
         model.budget, model.proven, model.lessons = min(model.budget, 5.0), 0, []
+        model.newest = 0, b""
         for lift in model.lifts.values():
             lift.lesson = None
 
@@ -229,7 +245,7 @@ class Lifts(RuleBasedStateMachine):
         self.part = trust(RiskLimits(self.model.alpha, outstanding_max=self.most))
         self.part.restore(decode(data))
         self.part.lifts.on_announced = self.heard.append
-        self.model.lifter = None
+        self.model.lifter, self.model.newest, self.model.offered = None, (0, b""), 0
 
     @rule(alpha=ALPHAS)
     def restart_with_another_risk(self, alpha: float | None) -> None:

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 
 from graspd.daemon.trust.lift_book import LIFTS_MAX, OutcomeStatus
 from graspd.daemon.trust.trust import DIGEST_BYTES, Trust, TrustState, decode, encode
-from graspd.models.trust.learner import sigmoid
+from graspd.models.trust.learner import Learner, sigmoid
 from graspd.models.trust.residual import GRASPS_MAX
 from graspd.models.trust.risk import Permission, RiskLimits
 from tests.daemon.trust.grasps import INPUTS, RULE, inputs, judge, named, trust
@@ -88,6 +88,44 @@ def test_an_announced_lift_is_not_counted_against_itself() -> None:
     assert part.review(named(3), former).permission is Permission.ALLOWED
     part.lifts.announce()
     assert part.review(named(3), former).permission is Permission.UNPROVEN
+
+
+@pytest.mark.parametrize(
+    ("steps", "taught"),
+    [
+        ("0 offer 1", 0),  # the second judgement is of the object in the air
+        ("0 1 offer", 1),  # the hand pressed harder before
+        ("0 1 offer 2", 1),
+        ("0 offer 1 offer 2", 1),
+        ("0 offer back 1 offer", 1),
+        ("0 1 refresh offer", 1),
+        ("0 1", 1),
+        ("0 1 refresh", 1),
+        ("0 stable 1", 2),  # who does not ask lifts on `stable`
+        ("0 offer stable 1", 0),
+    ],
+)
+def test_an_outcome_teaches_the_judgement_that_the_lift_began_on(steps: str, taught: int) -> None:
+    """Numbers are inputs that are judged after settling, `stable` number 2 with that verdict;
+    `refresh` judges others in between."""
+    part, features = trust(), dict[int, bytes]()
+    for step in steps.split():
+        if step == "offer":
+            part.lifts.announce()
+        elif step == "back":
+            part.lifts.take_back(named(1))
+        else:
+            number = {"stable": 2, "refresh": 3}.get(step) or int(step)
+            stable, settles = step == "stable", step != "refresh"
+            margin = -9.0 if stable else 2.2
+            found = part.judge(named(1), sigmoid(margin), margin, inputs(number))
+            part.note(named(1), found, stable=stable, judged=settles)
+            features[number] = found.features
+    part.outcome(named(1), slipped=False)
+    learner = Learner(INPUTS)
+    learner.learn(np.frombuffer(features[taught], "<f8"), slipped=False)
+    assert part.learner.state() == learner.state()
+    assert (part.risk.lifts, part.lifts.announced) == ("stable" in steps, 0)
 
 
 @pytest.mark.parametrize(
