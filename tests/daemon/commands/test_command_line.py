@@ -70,7 +70,7 @@ for words in {names!r}:
 def test_a_command_without_its_extra_says_how_to_install_it(
     arguments: list[str], extra: str, tmp_path: Path
 ) -> None:
-    own = LOOP.replace("../..", str(ROOT)).replace("/tmp/", f"{tmp_path}/")
+    own = LOOP.replace("/tmp/graspd-", f"{tmp_path}/").replace("../..", str(ROOT))
     (tmp_path / "loop.toml").write_text(own)
     code = f"{CORE_ONLY}\nsys.exit(main({arguments!r}))"
     done = ran(sys.executable, "-c", code, cwd=tmp_path)

@@ -208,6 +208,7 @@ def judged_grasps(judgements: list[Judgement]) -> list[tuple[int, Decision]]:
     return [(each.moment.grasp, each.decision) for each in judgements if each.moment.judged]
 
 
+@pytest.mark.slow
 def test_a_later_file_replays_alike_once_the_hand_was_idle(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -260,6 +260,7 @@ def outcomes_in(kept: KeptSession) -> int:
     return 0 if kept.trust is None else kept.trust.learner.outcomes
 
 
+@pytest.mark.slow
 def test_sessions_after_many_restarts_equal_those_of_a_simulation(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

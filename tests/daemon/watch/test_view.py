@@ -301,6 +301,7 @@ def test_each_second_keeps_its_tones_and_highest_slip_probability(
     assert list(history.seconds) == seconds
 
 
+@pytest.mark.slow
 @given(st.data())
 @settings(max_examples=300, deadline=None)
 def test_odd_values_stop_neither_the_view_nor_the_terminal(data: st.DataObject) -> None:
