@@ -35,7 +35,7 @@ class Link(StrEnum):
     NO_SOCKET = "not connected: the socket does not exist, no daemon runs there"
     NO_DAEMON = "not connected: no daemon publishes verdicts on this socket"
     NOT_ALLOWED = "not connected: this user may not open the socket; join the group graspd"
-    NEEDS_KEY = "turned away: the daemon wants a key (--keys), or it is no daemon"
+    NEEDS_KEY = "turned away: the daemon wants a key (--keys), or is not graspd"
     UNKNOWN_KEY = "turned away: the daemon does not know this key"
     TAKES_NO_KEYS = "turned away: this daemon takes no keys"
     WRONG_DAEMON = "turned away: is the daemon's key right?"
