@@ -13,17 +13,14 @@ from numpy.typing import NDArray
 from graspd.drivers.base import ANGLE_MAX_RAD, JointReading, joint_name
 from graspd.drivers.datagrams.messages import (
     DATAGRAM_BYTES_MAX,
-    LEAPS,
     SILENCE_NS,
     MessageCounters,
     Order,
     Stamp,
-    drop,
     number,
     read_message,
     write_message,
 )
-from graspd.drivers.link import SenderClock
 from graspd.drivers.udp import DatagramDriver
 
 _joint_of: Final = functools.lru_cache(maxsize=64)(joint_name)
@@ -62,8 +59,6 @@ class JointStream:
     def __init__(self) -> None:
         self.counters = JointCounters()
         self._order = Order(self.counters)
-        self._clock = SenderClock()
-        self._interrupted = False
 
     def interrupt(self) -> None:
         """Do nothing: the last number and time stay, so that no old message is mistaken for new."""
@@ -74,23 +69,18 @@ class JointStream:
 
         The reading's time is when the message was made, by its `t` and the quickest message.
         """
-        counters = self.counters
-        message, restarts = self.parse(data), counters.restarts
-        if message is None or not self._order.admits(message.stamp):
+        counters, message = self.counters, self.parse(data)
+        if message is None:
             return None
-        self._interrupted |= counters.restarts > restarts
-        leaps = self._clock.leaps(message.stamp.t_s, t_ns)
-        made_ns = self._clock.made_ns(message.stamp.t_s, t_ns)
-        if leaps:
-            drop(data, LEAPS, counters)
-            self._interrupted = True
+        made_ns = self._order.made_ns(data, message.stamp, t_ns)
+        if made_ns is None:
             return None
         if not message.names:
             return []
         seq = counters.readings + counters.missed_readings
         counters.readings += 1
         names, angles = message.names, message.position_rad
-        interrupted, self._interrupted = self._interrupted, False
+        interrupted = self._order.take_interrupted()
         return [JointReading(made_ns, seq, names, angles, interrupted=interrupted)]
 
     def parse(self, data: bytes) -> JointMessage | None:

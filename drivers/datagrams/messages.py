@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
+from graspd.drivers.link import SenderClock
 from graspd.drivers.udp import DatagramCounters
 
 DATAGRAM_BYTES_MAX = 4096
@@ -24,8 +25,6 @@ SEQ_JUMP_MAX: Final = 1000
 OLD_MESSAGES_MAX: Final = 10
 """Most old messages in a row, each newer than the last, that count as delayed. With one more the
 sender has restarted."""
-LEAPS: Final = "`t` leaps: is it in seconds?"
-"""Why a message is dropped whose time `SenderClock.leaps`."""
 
 _log = logging.getLogger(__name__)
 
@@ -128,14 +127,37 @@ def number(value: object) -> float:
 
 
 class Order:
-    """Finds which messages of a sender are new, and counts lost ones."""
+    """Finds which messages of a sender are new and when they were made, and counts lost ones."""
 
     def __init__(self, counters: MessageCounters) -> None:
+        self.interrupted = False
+        """True if the sender's stream was interrupted since the last `take_interrupted`."""
+        self._clock = SenderClock()
         self._counters = counters
         self._last = UNSTAMPED
         """Newest number and time."""
         self._last_old = UNSTAMPED
         self._old_in_a_row = 0
+
+    def made_ns(self, data: bytes, stamp: Stamp, t_ns: int) -> int | None:
+        """Return when a message that arrived at `t_ns` was made, by its `t` and the quickest
+        message; None if it is dropped: it is not new, or its `t` leaps. `data`: for the log."""
+        restarts = self._counters.restarts
+        if not self.admits(stamp):
+            return None
+        self.interrupted |= self._counters.restarts > restarts
+        leaps = self._clock.leaps(stamp.t_s, t_ns)
+        made_ns = self._clock.made_ns(stamp.t_s, t_ns)
+        if not leaps:
+            return made_ns
+        drop(data, "`t` leaps: is it in seconds?", self._counters)
+        self.interrupted = True
+        return None
+
+    def take_interrupted(self) -> bool:
+        """Return `interrupted`, and clear it: the reading that is made now has it."""
+        interrupted, self.interrupted = self.interrupted, False
+        return interrupted
 
     def admits(self, stamp: Stamp) -> bool:
         """Return True if the message is newer than all before, or the first after a restart.

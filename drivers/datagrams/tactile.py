@@ -14,16 +14,13 @@ from graspd.biotac import COUNT_MAX, ELECTRODES, FINGERS
 from graspd.drivers.base import ElectrodeFault, TactileReading
 from graspd.drivers.datagrams.messages import (
     DATAGRAM_BYTES_MAX,
-    LEAPS,
     SHOWN_BYTES_MAX,
     SILENCE_NS,
     Message,
     MessageCounters,
     Order,
-    drop,
     read_message,
 )
-from graspd.drivers.link import SenderClock
 from graspd.drivers.udp import DatagramDriver
 
 _log = logging.getLogger(__name__)
@@ -59,13 +56,11 @@ class TactileStream:
         self._fingers = tuple(fingers)
         self._hand = hand
         self._order = Order(self.counters)
-        self._clock = SenderClock()
-        self._interrupted = False
 
     def interrupt(self) -> None:
         """Mark the next reading as interrupted. The last number and time stay, so that no old
         message is mistaken for new."""
-        self._interrupted = self.counters.readings > 0
+        self._order.interrupted = self.counters.readings > 0
 
     def receive(self, data: bytes, t_ns: int) -> list[TactileReading] | None:
         """Return the reading of a message that arrived at `t_ns`; None if it is dropped.
@@ -81,15 +76,8 @@ class TactileStream:
                 _log.warning("datagrams: a message names the hand %r: dropped", message.hand)
             counters.other_hands += 1
             return None
-        restarts = counters.restarts
-        if not self._order.admits(message.stamp):
-            return None
-        self._interrupted |= counters.restarts > restarts
-        leaps = self._clock.leaps(message.stamp.t_s, t_ns)
-        made_ns = self._clock.made_ns(message.stamp.t_s, t_ns)
-        if leaps:
-            drop(data, LEAPS, counters)
-            self._interrupted = True
+        made_ns = self._order.made_ns(data, message.stamp, t_ns)
+        if made_ns is None:
             return None
         counters.late_messages += t_ns - made_ns > LATE_NS
         return [self._reading(message, made_ns)]
@@ -115,7 +103,7 @@ class TactileStream:
                 shown = str(dict(message.values))[:SHOWN_BYTES_MAX]
                 _log.warning("datagrams: not 24 counts in 0..4095 of each finger: %s", shown)
             counters.faulty_readings += 1
-        interrupted, self._interrupted = self._interrupted, False
+        interrupted = self._order.take_interrupted()
         return TactileReading(t_ns, seq, counts, faults, interrupted=interrupted)
 
     def _counts(self, values: object) -> list[int | None] | None:

@@ -245,7 +245,7 @@ def test_a_question_to_a_peer_that_refuses_raises_nothing(tmp_path: Path) -> Non
 
         wait_until(is_turned_away, 0.01)
         call.ask(b"clock")
-        assert call.socket is not None, "it connects anew"
+        assert call.socket is not None, "the next question has a new socket"
 
 
 def test_a_call_whose_end_fails_lets_the_next_begin() -> None:
