@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import logging
 import os
 import signal
 import threading
@@ -104,7 +105,8 @@ def comes_first() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def nothing_is_left_behind() -> Iterator[None]:
-    """Fail a test that leaves threads or descriptors behind."""
+    """Fail a test that leaves threads, descriptors or the log's level behind."""
+    level = logging.getLogger("graspd").level
     threads = threading.active_count()
     descriptors = _open_descriptors()
     yield
@@ -113,6 +115,7 @@ def nothing_is_left_behind() -> Iterator[None]:
     wait_until(lambda: threading.active_count() <= threads, says="a thread was left running")
     left = _open_descriptors() - descriptors
     assert not left, f"descriptors were left open: {sorted(left)}"
+    assert logging.getLogger("graspd").level == level
 
 
 def _open_descriptors() -> set[str]:

@@ -10,8 +10,8 @@ import pandas as pd
 import pytest
 
 from graspd import judge
-from graspd.daemon.cli import main
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
+from tests.kit.inside import graspd
 
 Change = Callable[[pd.DataFrame], pd.DataFrame]
 REST_ROWS, GRASP_ROWS = 100, 300
@@ -45,33 +45,30 @@ def without_thumb(stream: pd.DataFrame) -> pd.DataFrame:
         (without_thumb, "th never touched: all required fingers hold a grasp"),
     ],
 )
-def test_a_stream_without_a_judgement_says_why(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], change: Change, cause: str
-) -> None:
+def test_a_stream_without_a_judgement_says_why(tmp_path: Path, change: Change, cause: str) -> None:
     path = tmp_path / "stream.csv"
     change(pd.read_csv(DEMO_RECORDING)[:GRASP_ROWS]).to_csv(path, index=False)
-    assert main(["replay", str(path)]) == 1
-    said = capsys.readouterr().err
-    assert "nothing was judged:" in said
-    assert cause in said
+    done = graspd("replay", path)
+    assert done.returncode == 1
+    assert "nothing was judged:" in done.stderr
+    assert cause in done.stderr
     with pytest.warns(UserWarning, match="nothing was judged") as warned:
         list(judge(path))
     assert cause in str(warned[0].message)
 
 
-def test_a_table_of_broken_sensors_says_why(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_table_of_broken_sensors_says_why(tmp_path: Path) -> None:
     table = pd.read_csv(DEMO_TABLE)
     electrodes = [name for name in table.columns if "biotac" in name]
     random = np.random.default_rng(1)
     table[electrodes] = random.choice([0, 4095], (len(table), len(electrodes)))
     table.to_csv(tmp_path / "table.csv", index=False)
-    assert main(["replay", str(tmp_path / "table.csv")]) == 1
-    said = capsys.readouterr().err
-    assert f"{len(table)} of {len(table)} readings saturated: electrodes at 0 or 4095" in said
+    done = graspd("replay", tmp_path / "table.csv")
+    assert done.returncode == 1
+    said = f"{len(table)} of {len(table)} readings saturated: electrodes at 0 or 4095"
+    assert said in done.stderr
 
 
-def test_a_judged_recording_prints_no_explanation(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["replay", str(DEMO_RECORDING)]) == 0
-    assert capsys.readouterr().err == ""
+def test_a_judged_recording_prints_no_explanation() -> None:
+    done = graspd("replay", DEMO_RECORDING)
+    assert (done.returncode, done.stderr) == (0, "")

@@ -18,12 +18,12 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from graspd import judge, read_grasps, read_recording
 from graspd.biotac import electrode_columns
-from graspd.daemon.cli import main
 from graspd.daemon.publish.messages import Verdict
 from graspd.drivers.base import DriverError, RecordingError, TactileReading
 from graspd.drivers.recordings.bag import SENSOR, TACTILE, BagDriver, fingers_of, has_joints
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING
 from tests.drivers.recordings.bags import ABSENT, WITH_ARRAY, BagOf, Sweep
+from tests.kit.inside import refused
 
 START_NS = 1_542_585_600_000_000_000
 PERIOD_NS = 10_000_000
@@ -215,13 +215,10 @@ def test_values_not_counts_are_flagged_and_absent_sensors_refused(tmp_path: Path
         readings_of(path, ("ff", "rf"))
 
 
-def test_a_gzipped_bag_is_refused_with_advice_to_unpack(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_gzipped_bag_is_refused_with_advice_to_unpack(tmp_path: Path) -> None:
     path = BagOf(1).write(tmp_path / "hand.bag", noise(5))
     path.write_bytes(gzip.compress(path.read_bytes()))
-    assert main(["replay", str(path)]) == 2
-    assert "is a packed bag: `gunzip` it first" in capsys.readouterr().err
+    assert "is a packed bag: `gunzip` it first" in refused("replay", path)
     with pytest.raises(RecordingError, match="does not say how lifts ended"):
         read_grasps(path)
 
@@ -235,14 +232,11 @@ def test_a_bag_of_a_biotac_with_19_electrodes_is_refused(tmp_path: Path) -> None
         fingers_of(path)
 
 
-def test_options_of_tables_are_refused_for_a_bag(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_options_of_tables_are_refused_for_a_bag(tmp_path: Path) -> None:
     path = BagOf(1).write(tmp_path / "hand.bag", noise(5))
     said = "is a ROS 1 bag, which is played as it is: no "
     for options in (["--as", "table"], ["--rate-hz", "50"], ["--loop"], ["--strict"]):
-        assert main(["replay", str(path), *options]) == 2
-        assert f"{said}{options[0]}" in capsys.readouterr().err
+        assert f"{said}{options[0]}" in refused("replay", path, *options)
     with pytest.raises(RecordingError, match=f"{said}read_as"):
         list(judge(path, read_as="table"))
     with pytest.raises(RecordingError, match=f"{said}rate_hz"):
@@ -339,17 +333,16 @@ def test_bags_of_different_hands_are_refused_as_one_run(tmp_path: Path) -> None:
             driver.read_ready()
 
 
-def test_a_bag_needs_a_tactile_topic_and_refuses_gate_every(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_bag_needs_a_tactile_topic_and_refuses_gate_every(tmp_path: Path) -> None:
     bag = BagOf(1)
     with rosbag1.Writer(tmp_path / "arm.bag") as writer:
         writer.add_connection("/arm/joints", "sensor_msgs/msg/JointState", typestore=bag.store)
-    assert main(["replay", str(tmp_path / "arm.bag")]) == 2
-    assert "no topic of sr_robot_msgs/BiotacAll, but /arm/joints" in capsys.readouterr().err
+    assert "no topic of sr_robot_msgs/BiotacAll, but /arm/joints" in refused(
+        "replay", tmp_path / "arm.bag"
+    )
     path = bag.write(tmp_path / "hand.bag", noise(5))
-    assert main(["replay", str(path), "--gate", "every"]) == 2
-    assert "gate mode `every` judges each row of a grasp table" in capsys.readouterr().err
+    said = refused("replay", path, "--gate", "every")
+    assert "gate mode `every` judges each row of a grasp table" in said
 
 
 @pytest.mark.parametrize("seed", range(4))
