@@ -9,7 +9,13 @@ from tests.process_replay.__main__ import KINDS, SHOWN_MAX
 from tests.process_replay.commands import lines_apart
 from tests.process_replay.verdicts import entries_apart, reference
 
-ALL = [(kind, name) for kind in KINDS for name in KINDS[kind].NAMES]
+SLOW = ("can_log",)
+"""Names of the references that take many seconds to make."""
+ALL = [
+    pytest.param(kind, name, marks=pytest.mark.slow if name in SLOW else ())
+    for kind in KINDS
+    for name in KINDS[kind].NAMES
+]
 
 
 @pytest.mark.parametrize(("kind", "name"), ALL)

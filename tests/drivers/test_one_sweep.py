@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -52,10 +53,6 @@ BASE_ID = 0x100
 SILENT_NS = 110 * MS
 """How long a board says nothing after a reset, as deploy/can/PROTOCOL.md asks."""
 WORDS = [word(count) for count in range(4096)]
-PACKETS = [
-    packet.to_bytes() for packet in PalmTwin(counts_of(number) for number in range(600)).packets()
-]
-"""Packets of a palm, in more rounds than the longest plan has."""
 SEQ_FIRST = (1 << 32) - 9
 """Number of a bridge's first sweep, soon before it wraps."""
 SWEEPS_PER_BOOT = 700
@@ -66,6 +63,13 @@ Feed = Callable[[Unit, int, int], Sequence[Reading]]
 Link = tuple[Feed, DriverCounters]
 COPIES = ("duplicates", "duplicate_frames", "duplicate_packets", "old_messages")
 """Names of the links' counters of repeated units."""
+
+
+@cache
+def packets() -> list[bytes]:
+    """Packets of a palm, in more rounds than the longest plan has."""
+    twin = PalmTwin(counts_of(number) for number in range(600))
+    return [packet.to_bytes() for packet in twin.packets()]
 
 
 def words_of(number: int) -> NDArray[np.uint16]:
@@ -87,7 +91,7 @@ def palm() -> Link:
     stream = PalmStream(FINGERS)
 
     def feed(unit: Unit, _number: int, t_ns: int) -> Sequence[Reading]:
-        data = PACKETS[unit.index + PALM_SHIFT * unit.boot]
+        data = packets()[unit.index + PALM_SHIFT * unit.boot]
         return stream.receive(data, t_ns) or ()
 
     return feed, stream.counters

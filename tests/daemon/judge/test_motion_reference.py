@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from graspd.daemon.judge.stillness import Motion
 
@@ -73,7 +73,7 @@ def found_in(times_ns: NDArray[np.int64], counts: Floats, *, early: bool) -> Fou
     variance, (near, far) = noise_of(steps)
     fingers = counts.shape[1]
     share = 1.0 - (1.0 - FALSE_ALARMS) ** (1.0 / fingers)
-    tail, rare = norm.isf(share), norm.isf(0.1 * share)
+    tail, rare = -ndtri(share), -ndtri(0.1 * share)
 
     def window(seconds: float) -> tuple[Floats, Floats]:
         within = times > times[-1] - seconds + 1e-9

@@ -10,7 +10,7 @@ import pytest
 from tests.daemon.run import days
 
 
-@pytest.mark.parametrize("seed", [3, 4, 5, 6])
+@pytest.mark.parametrize("seed", [3, 5])
 def test_the_daemons_promises_hold_on_a_day_of_faults(seed: int) -> None:
     day = days.run(seed)
     assert day.said["stable"] > 0
@@ -18,6 +18,6 @@ def test_the_daemons_promises_hold_on_a_day_of_faults(seed: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(100, 130))
+@pytest.mark.parametrize("seed", [4, 6, *range(100, 110)])
 def test_the_daemons_promises_hold_on_many_days_of_faults(seed: int) -> None:
     days.run(seed)
