@@ -187,8 +187,16 @@ class SessionKeeper(SensorWatch):
             self._unused = learned.trust
         elif learned is not None and self._trust is not None:
             log.info("%d outcomes restored", self._trust.learner.outcomes)
+        session = self._session
+        if session is not None and not session.calibrated and self._has_other_sensors(used):
+            pipeline.needs_session = True  # so was it before this start, as they were exchanged
         if isinstance(found[0], SessionFileError):  # the unreadable session may be of other sensors
             self._begin(None)
+
+    def _has_other_sensors(self, used: KeptSession) -> bool:
+        """Return True if a session of these fingers with other sensors than `used` is kept too."""
+        of_fingers = (each for each in self._others if each.fingers == self._fingers)
+        return not all(is_of_sensors(each, used) for each in of_fingers)
 
     def _with_serials(self, serials: Mapping[str, str]) -> KeptSession | None:
         now = numbers(serials).items()

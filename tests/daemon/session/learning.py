@@ -129,9 +129,11 @@ class FakeJudge:
         """`part`: what learns; None: nothing. `read_rest`: returns the resting counts of the open
         hand. `hear`: called at each exchange."""
         self.session, self.trust, self.read_rest, self.hear = session, part, read_rest, hear
+        self.needs_session = False
 
     def sensors_exchanged(self, known: Exchanged = NOTHING_KNOWN) -> None:
         self.hear()
+        self.needs_session = True
         if self.session is not None:
             self.session.reset()
             if known.session is not None:

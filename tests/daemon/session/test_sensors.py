@@ -6,6 +6,7 @@ import itertools
 import logging
 from contextlib import ExitStack
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -26,10 +27,11 @@ from graspd.daemon.trust.trust import Trust
 from graspd.drivers.twins.grasps.whole_grasps import rest_above
 from graspd.models.judge.session import SessionCalibration
 from graspd.models.trust.risk import BUDGET_START
-from tests.daemon.fakes import FINGERS, reading
+from tests.daemon.fakes import FINGERS, Clock, reading
 from tests.daemon.session.learning import (
     BOOT,
     INPUTS,
+    FakeJudge,
     calibration,
     judge,
     observe,
@@ -160,6 +162,20 @@ def test_a_hand_closed_at_start_continues_its_session_once_open(tmp_path: Path) 
         keeper.save()
     assert (again.grasps, later.risk.proven) == (30, 12)
     assert later.learner.state() == learned
+
+
+def test_exchanged_sensors_must_calibrate_after_a_restart_too(tmp_path: Path) -> None:
+    needs = []
+    with SessionFolder(tmp_path / "right") as folder:
+        for rest, grasps in ((PATTERN, 30), (HELD, 5), (HELD, 25), (HELD, 0)):
+            hand = FakeJudge(session := calibration(), read_rest=rest.copy)
+            keeper = SessionKeeper(cast(Pipeline, hand), FINGERS, sensors(), folder, Clock())
+            before = hand.needs_session
+            look(keeper)
+            needs.append((before, hand.needs_session))
+            observe(session, grasps)
+            keeper.save()
+    assert needs == [(False, False), (False, True), (True, True), (False, False)]
 
 
 def test_another_sending_port_alone_is_not_an_exchange_of_sensors(tmp_path: Path) -> None:
