@@ -45,6 +45,11 @@ NOT_OURS: dict[Cause, tuple[str, ...]] = {
 }
 """Counters, by cause, that explain why a link receives data but gives no reading. The first cause
 with a counter above 0 is reported."""
+STILL_COMES = frozenset({Cause.MESSAGES, Cause.FOREIGN_SENDER, Cause.PALM_MODE})
+"""Causes in `NOT_OURS` that also explain why readings stopped. The counters of the others rise with
+a link that breaks."""
+STOPPED_SHARE = 0.1
+"""Share of the readings from which on such a counter, of `BAD_MIN` or more, explains it."""
 NOT_OURS_ADVICE = {
     Cause.VERSION: "No known palm sends this length. Other firmware, or a relay that adds bytes.",
     Cause.MESSAGES: "They are of another form than deploy/wire/TACTILE.md or JOINTS.md.",
@@ -208,11 +213,9 @@ def device_findings(
         elif losses and link.fault in BETWEEN:
             what += f"; it was up and was lost {losses} {'time' if losses == 1 else 'times'}"
             trouble = TROUBLES[LinkCause.DISCONNECTED]
-        elif trouble.cause is Cause.SILENT:
-            for cause, names in NOT_OURS.items():
-                if counted := _counted(names, counters):
-                    what, trouble = f"{what}, but {counted}", Trouble(cause, NOT_OURS_ADVICE[cause])
-                    break
+        elif (cause := _not_ours(link.fault, counters)) is not None:
+            what = f"{what}, but {_counted(NOT_OURS[cause], counters)}"
+            trouble = Trouble(cause, NOT_OURS_ADVICE[cause])
         return [Finding(Level.ERROR, what, trouble.cause, trouble.advice)]
     found = [] if link is None else [fine(f"{driver}: link up")]
     for key, fact in facts.items():
@@ -245,6 +248,20 @@ def rate_finding(driver: str, readings: int, seconds: float, period_ns: int | No
         advice = "Nothing was lost. The board is slow, or this computer is busy (top)."
         return Finding(Level.WARNING, what, Cause.SLOW, advice)
     return fine(what)
+
+
+def _not_ours(fault: LinkCause | DeviceFault, counters: Mapping[str, int]) -> Cause | None:
+    """Return why data that arrives gives no reading, by `NOT_OURS`; None: not known."""
+    if TROUBLES[fault].cause is Cause.SILENT:
+        causes, least = frozenset(NOT_OURS), 1.0
+    elif fault is LinkCause.TIMEOUT:
+        causes, least = STILL_COMES, max(BAD_MIN, STOPPED_SHARE * counters.get("readings", 0))
+    else:
+        return None
+    for cause, names in NOT_OURS.items():
+        if cause in causes and sum(counters.get(name, 0) for name in names) >= least:
+            return cause
+    return None
 
 
 def _is_too_much(cause: Cause, counters: Mapping[str, int]) -> bool:

@@ -260,6 +260,26 @@ def test_a_flapping_link_counts_as_lost_unless_access_is_denied(now: LinkCause) 
     assert finding.cause is Cause.PORT_DENIED
 
 
+@pytest.mark.parametrize(
+    ("counters", "cause"),
+    [
+        ({"readings": 1, "bad_messages": 190}, Cause.MESSAGES),  # `t` in ms
+        ({"readings": 230, "other_hands": 70}, Cause.FOREIGN_SENDER),
+        ({"readings": 70, "service_packets": 900}, Cause.PALM_MODE),
+        ({"readings": 230, "bad_messages": 5}, Cause.LINK_LOST),  # damaged while it was up
+        ({"readings": 2, "bad_messages": 4}, Cause.LINK_LOST),
+        ({"readings": 100, "frames": 2400, "foreign_frames": 900}, Cause.LINK_LOST),
+        ({"readings": 100, "bad_crc": 30, "error_frames": 30}, Cause.LINK_LOST),
+    ],
+)
+def test_readings_that_stopped_while_data_comes_are_explained(
+    counters: dict[str, int], cause: Cause
+) -> None:
+    device = {"link": Fact("waiting", LinkCause.TIMEOUT)}
+    (finding,) = device_findings("x", device, counters)
+    assert (finding.level, finding.cause) == (Level.ERROR, cause)
+
+
 def test_state_and_bit_rate_of_can_interfaces_are_read(tmp_path: Path) -> None:
     for name, state in (("can0", "up"), ("vcan0", "unknown"), ("can1", "down")):
         (tmp_path / "net" / name).mkdir(parents=True)
