@@ -19,7 +19,7 @@ from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.plan import Plan
 from graspd.daemon.commands.arguments import within
 from graspd.daemon.doctor import computer
-from graspd.daemon.doctor.electrodes import ElectrodeStatistics
+from graspd.daemon.doctor.electrodes import FAULTY_FRACTION, ElectrodeStatistics
 from graspd.daemon.doctor.finding import Cause, Finding, Level, fine, roots
 from graspd.daemon.doctor.link import counter_findings, device_findings, rate_finding
 from graspd.daemon.doctor.surroundings import (
@@ -48,7 +48,13 @@ COLOURS = {"ok ": Colour.GREEN, "!  ": Colour.YELLOW, "!! ": Colour.RED}
 NARROWEST = 40
 """Fewest columns to which lines are wrapped."""
 WHOLE_DEVICE = frozenset({Cause.SENSOR_ABSENT, Cause.REPEATED, Cause.CLOCK})
-"""Faults of a whole device that make all fingers seem absent; `FRAMES_LOST` as an error too."""
+"""Faults of a whole device that make all fingers seem absent; `FRAMES_LOST` as an error too, and
+`MESSAGES` if no finger can be read."""
+NOT_SENT = (
+    "Each message must have it: see deploy/wire/TACTILE.md. If it does, check the sensor's plug "
+    "and supply."
+)
+"""Advice on a finger that cannot be read in the messages of another program."""
 FINGER_COLUMNS = 25
 """Width of a finger in the table of electrodes, characters."""
 USUAL_COLUMNS = 80
@@ -123,7 +129,7 @@ def examine(
         what = f"{told[0].what}; no reading in {seconds:.1f} s"
         told[0] = dataclasses.replace(told[0], what=what)
     if statistics is not None and readings:
-        told = _with_electrodes(told, statistics)
+        told = _with_electrodes(told, statistics, driver.name)
     return roots(told)
 
 
@@ -241,16 +247,25 @@ def _collect(drivers: Sequence[Driver], statistics: ElectrodeStatistics, listen_
     return (last_s - first_s) * statistics.readings / (statistics.readings - 1)
 
 
-def _with_electrodes(told: list[Finding], statistics: ElectrodeStatistics) -> list[Finding]:
+def _with_electrodes(
+    told: list[Finding], statistics: ElectrodeStatistics, driver: str
+) -> list[Finding]:
     """Return `told`, findings on the device, and those on electrodes. If all fingers are absent and
     `told` explains it, leave those out; what explains it becomes an error."""
-    electrodes = statistics.findings()
+    electrodes = [
+        dataclasses.replace(finding, advice=NOT_SENT)
+        if driver == "datagrams" and finding.cause is Cause.SENSOR_ABSENT
+        else finding
+        for finding in statistics.findings()
+    ]
+    unread = bool((statistics.faulty > FAULTY_FRACTION * statistics.readings).all())
     absent = [finding for finding in electrodes if finding.cause is Cause.SENSOR_ABSENT]
     whole = [
         finding
         for finding in told
         if finding.cause in WHOLE_DEVICE
         or (finding.cause is Cause.FRAMES_LOST and finding.level is Level.ERROR)
+        or (finding.cause is Cause.MESSAGES and unread)
     ]
     if not whole or len(absent) < len(statistics.fingers):
         return told + electrodes

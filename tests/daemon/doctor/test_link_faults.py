@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import errno
+import json
 import socket
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
 from graspd.daemon.commands.doctor import examine
 from graspd.daemon.doctor.electrodes import ElectrodeStatistics
-from graspd.daemon.doctor.finding import Cause, Level
+from graspd.daemon.doctor.finding import Cause, Finding, Level
 from graspd.daemon.doctor.link import counter_findings, device_findings
+from graspd.drivers.base import TactileReading
 from graspd.drivers.biotac import SEQUENCES
 from graspd.drivers.can.frames import ERROR, CanFrame
 from graspd.drivers.can.stream import CanStream
+from graspd.drivers.datagrams.tactile import TactileStreamDriver
 from graspd.drivers.spi.messages import FIRMWARE
 from graspd.drivers.twins import spi as spi_twin
 from graspd.drivers.twins.can import CanTwin
@@ -33,6 +37,7 @@ from tests.daemon.doctor.emulated import (
 )
 from tests.drivers.can.can_standin import DownSocket, ScriptedBus, SocketBus, stand_in
 from tests.drivers.can.test_can_socket import over_socket
+from tests.kit.clock import Clock
 
 LOOK_S = 3
 QUARTER_S, EVERY_S = 900, 20
@@ -155,6 +160,45 @@ def test_bus_off_and_a_can_interface_going_down_are_reported(
             driver.read_ready()
             (finding,) = examine(driver, None, 1.0)
     assert finding.cause is Cause.INTERFACE_DOWN
+
+
+def told_of(messages: Sequence[object]) -> list[Finding]:
+    """Return the findings on a sender of these `counts`, one message each, that need a look."""
+    statistics = ElectrodeStatistics(FINGERS)
+    driver = TactileStreamDriver("udp://127.0.0.1:0", clock=Clock())
+    with driver, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for seq, counts in enumerate(messages):
+            data = json.dumps({"seq": seq, "counts": counts}).encode()
+            sender.sendto(data, ("127.0.0.1", driver.port or 0))
+            for reading in driver.read_ready():
+                assert isinstance(reading, TactileReading)
+                statistics.add(reading)
+        told = examine(driver, statistics, 1.0)
+    return [finding for finding in told if finding.level is not Level.OK]
+
+
+@pytest.mark.parametrize(
+    ("prefix", "value"),
+    [("", [*range(2000, 2019)]), ("rh_", [*range(2000, 2024)]), ("", [0.5, *[0.25] * 23])],
+    ids=["19 counts", "other names", "fractions"],
+)
+def test_counts_of_another_form_are_messages_and_no_absent_sensor(
+    prefix: str, value: list[float]
+) -> None:
+    (told,) = told_of([{prefix + finger: value for finger in FINGERS}] * 20)
+    assert (told.level, told.cause) == (Level.ERROR, Cause.MESSAGES)
+
+
+def test_bad_messages_hide_no_fingers_whose_counts_are_at_the_end() -> None:
+    ended = {finger: [1, *[0] * 23] for finger in FINGERS}
+    told = told_of([ended] * 20 + [5])
+    assert {finding.cause for finding in told} == {Cause.MESSAGES, Cause.SENSOR_ABSENT}
+
+
+def test_fingers_that_no_message_has_are_not_blamed_on_plugs() -> None:
+    told = told_of([{finger: [*range(2000, 2024)]} for finger in FINGERS] * 10)
+    assert {finding.cause for finding in told} == {Cause.SENSOR_ABSENT}
+    assert all((each.advice or "").startswith("Each message must have it") for each in told)
 
 
 SLCAN = CAN + 'interface = "slcan"\n'
