@@ -96,7 +96,7 @@ EXPLAINS: dict[Cause | None, frozenset[Cause]] = {
     Cause.SETTINGS: _LOSS,
     Cause.PALM_MODE: _LOSS,
     Cause.MESSAGES: frozenset({Cause.FRAMES_LOST, Cause.RESTARTED, Cause.SENSOR_WORDS}),
-    Cause.FRAMES_LOST: frozenset({Cause.SLOW, Cause.ELECTRODE_UNREAD}),
+    Cause.FRAMES_LOST: _LOSS - {Cause.FRAMES_LOST},
 }
 """Consequences of each cause. They are not reported beside it."""
 

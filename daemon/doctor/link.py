@@ -70,7 +70,7 @@ COUNTERS: dict[Cause, tuple[str, ...]] = {
         *("wrong_length_frames", "unknown_commands", "nonsense_packets", "bad_lengths"),
         "not_counts",
     ),
-    Cause.COMPUTER_BUSY: ("kernel_drops", "untimed_frames", "host_tx_dropped"),
+    Cause.COMPUTER_BUSY: ("kernel_drops", "host_tx_dropped"),
     Cause.CLOCK: ("clock_faults",),
     Cause.REPEATED: (
         *("duplicates", "duplicate_frames", "duplicate_packets", "conflicting_packets"),
@@ -81,7 +81,7 @@ COUNTERS: dict[Cause, tuple[str, ...]] = {
     Cause.FRAMES_LOST: (
         *("missed_readings", "lost_frames", "lost_packets", "cut_sweeps", "interrupted_sweeps"),
         *("interrupted_rounds", "controller_overflows", "late_messages"),
-        *("unsynchronised_frames", "unsynchronised_packets"),
+        *("unsynchronised_frames", "unsynchronised_packets", "untimed_frames"),
     ),
     Cause.OUT_OF_ORDER: (
         *("reordered", "reordered_frames", "reordered_packets", "late_frames", "late_packets"),
@@ -112,6 +112,11 @@ ADVICE = {
     Cause.MESSAGES: "What does not fit is left out: see deploy/wire/TACTILE.md or JOINTS.md.",
     Cause.RECORDING: "The recording is damaged or ends in the middle. Record it again.",
 }
+HELD_BACK = (
+    "The adapter or this computer holds frames back. Set the adapter's latency timer to 1 ms "
+    "(deploy/can/PROTOCOL.md); see top."
+)
+"""Advice on `FRAMES_LOST` with `untimed_frames`."""
 TROUBLES: dict[LinkCause | DeviceFault, Trouble] = {
     LinkCause.UNKNOWN: Trouble(
         Cause.LINK_DOWN, "Check that it is powered, connected, and the one that the scene names."
@@ -230,7 +235,9 @@ def counter_findings(driver: str, counters: Mapping[str, int]) -> list[Finding]:
     for cause, names in COUNTERS.items():
         if counted := _counted(names, counters):
             level = Level.ERROR if _is_too_much(cause, counters) else Level.WARNING
-            found.append(Finding(level, f"{driver}: {counted}", cause, ADVICE[cause]))
+            is_held_back = cause is Cause.FRAMES_LOST and counters.get("untimed_frames", 0)
+            advice = HELD_BACK if is_held_back else ADVICE[cause]
+            found.append(Finding(level, f"{driver}: {counted}", cause, advice))
     return found
 
 

@@ -12,8 +12,8 @@ import pytest
 
 from graspd.daemon.commands.doctor import examine
 from graspd.daemon.doctor.electrodes import ElectrodeStatistics
-from graspd.daemon.doctor.finding import Cause, Finding, Level
-from graspd.daemon.doctor.link import counter_findings, device_findings
+from graspd.daemon.doctor.finding import Cause, Finding, Level, roots
+from graspd.daemon.doctor.link import counter_findings, device_findings, rate_finding
 from graspd.drivers.base import TactileReading
 from graspd.drivers.biotac import SEQUENCES
 from graspd.drivers.can.frames import ERROR, CanFrame
@@ -141,6 +141,33 @@ def test_another_sampling_sequence_on_the_can_board_is_reported(scene: str, boar
     told += counter_findings("can", stream.counters.as_dict())
     causes = {finding.cause for finding in told} - {None}
     assert causes == ({Cause.SETTINGS} if scene != board else set())
+
+
+@pytest.mark.parametrize("every_ms", [8, 16])
+def test_an_adapter_that_holds_frames_back_is_named(every_ms: int) -> None:
+    """It has no stamps. Nothing else is wrong: its frames are read at once."""
+    stream = CanStream("bus", FINGERS)
+    stream.link.greeting()
+    twin = CanTwin("virtual", "bus", iter(Hand(100.0)))
+    waiting: list[CanFrame] = []
+    since_ns = 0
+    for sweep in range(100):
+        frames = twin.next_frames()
+        for place, (identifier, data) in enumerate(frames):
+            t_ns = 10_000_000 * sweep + 10_000_000 * place // len(frames)
+            if t_ns >= since_ns + every_ms * 1_000_000:
+                until_ns = since_ns + every_ms * 1_000_000
+                stream.receive([(frame, since_ns, until_ns) for frame in waiting])
+                stream.watch(until_ns)
+                waiting, since_ns = [], until_ns
+            waiting.append(CanFrame(identifier, data))
+    counters = stream.counters.as_dict()
+    told = [*device_findings("can", stream.describe(), counters)]
+    told += counter_findings("can", counters)
+    told.append(rate_finding("can", counters["readings"], 1.0, stream.period_ns))
+    (finding,) = (each for each in roots(told) if each.level is not Level.OK)
+    assert (finding.level, finding.cause) == (Level.ERROR, Cause.FRAMES_LOST)
+    assert "latency timer to 1 ms" in (finding.advice or "")
 
 
 def test_bus_off_and_a_can_interface_going_down_are_reported(
