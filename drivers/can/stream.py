@@ -119,14 +119,15 @@ class CanStream:
         return facts
 
     def _has_sequence(self) -> bool:
-        """Return False if samples of channels that are not electrodes are below 1/4 or above 4
-        times the number that the sequence has; True before `READINGS_MIN`."""
+        """Return False if the ratio of other channels' samples to those of electrodes is below 1/4
+        or above 4 times that of the sequence; True before `READINGS_MIN`."""
         counters, expected = self.counters, len(SEQUENCES[self._sequence]) - ELECTRODES
         readings = counters.readings
-        others = counters.accepted_frames - ELECTRODES * readings + counters.lost_frames
         if readings < READINGS_MIN or not expected:  # other samples count as `unexpected_channels`
             return True
-        return 0.25 < others / (expected * readings) < 4.0
+        electrodes = ELECTRODES * readings - counters.lost_frames
+        others = counters.accepted_frames - electrodes
+        return 0.25 < others / electrodes * ELECTRODES / expected < 4.0
 
     def receive(self, frames: Sequence[Stamped]) -> tuple[list[Reading], LinkError | None]:
         """Return the completed readings, oldest first, and why the bus is lost; None: it is not."""

@@ -8,6 +8,7 @@ import socket
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from graspd.daemon.commands.doctor import examine
@@ -17,7 +18,7 @@ from graspd.daemon.doctor.link import counter_findings, device_findings, rate_fi
 from graspd.drivers.base import TactileReading
 from graspd.drivers.biotac import SEQUENCES
 from graspd.drivers.can.frames import ERROR, CanFrame
-from graspd.drivers.can.stream import CanStream
+from graspd.drivers.can.stream import READINGS_MIN, CanStream
 from graspd.drivers.datagrams.tactile import TactileStreamDriver
 from graspd.drivers.spi.messages import FIRMWARE
 from graspd.drivers.twins import spi as spi_twin
@@ -141,6 +142,32 @@ def test_another_sampling_sequence_on_the_can_board_is_reported(scene: str, boar
     told += counter_findings("can", stream.counters.as_dict())
     causes = {finding.cause for finding in told} - {None}
     assert causes == ({Cause.SETTINGS} if scene != board else set())
+
+
+@pytest.mark.parametrize(
+    ("sequence", "period_ms", "loss"),
+    [
+        *(("interleaved", 200, 0.0), ("interleaved", 125, 0.0), ("all", 100, 0.0)),
+        *(("all", 67, 0.0), ("interleaved", 10, 0.8), ("all", 10, 0.8)),
+    ],
+)
+def test_a_slow_or_lossy_board_has_the_sequence_it_has(
+    sequence: str, period_ms: int, loss: float
+) -> None:
+    stream, random = CanStream("bus", FINGERS, sequence=sequence), np.random.default_rng(0)
+    stream.link.greeting()
+    twin = CanTwin("virtual", "bus", iter(Hand(100.0)), sequence=sequence)
+    for sweep in range(max(15, 1000 // period_ms)):
+        frames = twin.next_frames()
+        for place, (identifier, data) in enumerate(frames):
+            t_ns = (len(frames) * sweep + place) * period_ms * 1_000_000 // len(frames)
+            if random.random() >= loss:
+                stream.receive([(CanFrame(identifier, data), t_ns, t_ns)])
+                stream.watch(t_ns)
+    assert stream.counters.readings >= READINGS_MIN
+    counters = stream.counters.as_dict()
+    told = device_findings("can", stream.describe()) + counter_findings("can", counters)
+    assert {finding.cause for finding in told} - {None} == {Cause.FRAMES_LOST}
 
 
 @pytest.mark.parametrize("every_ms", [8, 16])
