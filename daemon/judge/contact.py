@@ -18,6 +18,12 @@ from graspd.biotac import COUNT_MAX, ELECTRODES
 
 WINDOW = 100
 """Untouched sweeps whose median is a baseline: one second at 100 Hz."""
+READ_MIN = 60
+"""Fewest of the sweeps of a window in which an electrode with a baseline was usable, of `WINDOW`.
+
+A link that loses 5 % of single samples leaves nearly all electrodes as many. An electrode that is
+broken for longer has no baseline.
+"""
 TARE_EVERY = 25
 """Untouched sweeps from one tare to the next."""
 TOUCH_COUNTS = 20.0
@@ -183,9 +189,14 @@ class Window:
         return cls(np.zeros(shape, dtype=np.uint16), np.zeros(shape, dtype=np.bool_))
 
     def add(self, counts: NDArray[np.uint16], usable: NDArray[np.bool_] | None) -> None:
-        """Take in a sweep, shape (fingers, 24), and which electrodes are usable; None: all."""
+        """Take in a sweep, shape (fingers, 24), and which electrodes are usable; None: all.
+
+        The others keep their value of the sweep before.
+        """
         place = self.number % WINDOW
-        self.counts[place] = counts
+        self.counts[place] = (
+            counts if usable is None else np.where(usable, counts, self.counts[place - 1])
+        )
         self.usable[place] = True if usable is None else usable
         self.number += 1
 
@@ -203,7 +214,7 @@ class Window:
         # A median may end in .5: doubled, all values are whole numbers.
         twice = np.abs(2 * window - (2.0 * baseline).astype(np.int32)[..., np.newaxis])
         sigmas = MAD_TO_SIGMA * (_median(twice) / 2.0)
-        usable = np.logical_and.reduce(self.usable, axis=0)
+        usable = np.count_nonzero(self.usable, axis=0) >= READ_MIN
         sound = (baseline > 0) & (baseline < COUNT_MAX) & (sigmas <= 3.0 * SIGMA_MAX_COUNTS)
         sound &= usable
         for finger in fingers:

@@ -15,7 +15,7 @@ from graspd.daemon.judge.hand import GAP_NS
 from graspd.daemon.judge.pipeline import Judgement
 from graspd.daemon.judge.reasons import ADVICE, OPEN, UNREADABLE, Reason
 from graspd.daemon.publish.companion import Companion, PublishedVerdict
-from graspd.drivers.base import ANGLE_MAX_RAD, DriverCounters, JointReading, Reading
+from graspd.drivers.base import ANGLE_MAX_RAD, DriverCounters, JointReading, Reading, TactileReading
 
 STEPS: Final = 20
 """Number of the first steps between readings, whose median is the usual step."""
@@ -52,6 +52,8 @@ class Unjudged(Companion):
         self._is_judged = False
         self._unreadable: Counter[Reason] = Counter()
         """Count of each reason of readings that cannot be used."""
+        self._faulty = 0
+        """Number of readings in which electrodes were not read."""
         self.readings = 0
         self.judged = 0
         """Grasps that were judged."""
@@ -59,8 +61,10 @@ class Unjudged(Companion):
         """Number of unjudged grasps by their most frequent reason."""
 
     def on_reading(self, reading: Reading) -> None:
-        """Report the first angle that no joint can have."""
-        if isinstance(reading, JointReading) and self._angle is None:
+        """Report the first angle that no joint can have; count faulty tactile readings."""
+        if isinstance(reading, TactileReading):
+            self._faulty += bool(reading.faults.any())
+        elif self._angle is None:
             self._look_at_angles(reading)
 
     def on_verdict(self, published: PublishedVerdict) -> None:
@@ -137,9 +141,10 @@ class Unjudged(Companion):
     def _rest_in_words(self) -> str:
         """Return text on how long the hand must be open for a tare at the rate of the readings."""
         rest_s = WINDOW * median(self._steps_s) if self._steps_s else 1.0
+        faulty = f", or electrodes were not read ({self._faulty} readings)" if self._faulty else ""
         return (
-            f"no {WINDOW} readings of an open hand come first ({rest_s:.2g} s at this rate): it is "
-            "not known where the fingers rest"
+            f"no {WINDOW} readings of an open hand come first ({rest_s:.2g} s at this rate){faulty}"
+            ": it is not known where the fingers rest"
         )
 
     def _damage_in_words(self) -> str | None:

@@ -216,6 +216,23 @@ def test_a_tare_needs_twelve_usable_electrodes(usable: int, known: int | None) -
     assert (None if rest is None else int(rest[2].sum())) == known
 
 
+@pytest.mark.parametrize(("missed", "known"), [(1, True), (40, True), (41, False), (99, False)])
+def test_electrodes_read_in_60_of_100_sweeps_have_a_baseline(missed: int, known: bool) -> None:
+    rests: list[Rest | None] = []
+    for read_as in (0, 4095):
+        window, lost = Window.of(1), np.linspace(1, 99, missed).round()
+        for place, counts in enumerate(wavering(4)):
+            usable = np.ones((1, 24), dtype=np.bool_)
+            usable[0, 5] = place not in lost
+            window.add(np.where(usable, counts, np.uint16(read_as)), usable)
+        rests += window.rests([0])
+    for rest in rests:
+        assert rest is not None
+        assert rest.known.tolist() == [electrode != 5 or known for electrode in range(24)]
+        assert rest.sigma == pytest.approx(4 * 1.4826)
+        assert abs(rest.baseline[5] - 3000.0) <= 4.0, "what a missed sample reads has no effect"
+
+
 @pytest.mark.parametrize(
     ("low", "high", "known"),
     [
@@ -275,16 +292,23 @@ class Hand:
         self.fresh = FreshMedian((3, 24))
         self.t_ns = 10**12
 
-    def feel(self, counts: Counts) -> None:
-        self.fresh.push(counts, None)
-        self.contact.observe(self.t_ns, counts, self.fresh.counts, None)
+    def feel(self, counts: Counts, usable: NDArray[np.bool_] | None = None) -> None:
+        self.fresh.push(counts, usable)
+        self.contact.observe(self.t_ns, counts, self.fresh.counts, usable)
         self.t_ns += PERIOD_NS
 
-    def play(self, sweeps: Counts) -> NDArray[np.bool_]:
-        """Return which fingers touched in each sweep, shape (sweeps, fingers)."""
+    def play(self, sweeps: Counts, lost: float = 0.0) -> NDArray[np.bool_]:
+        """Return which fingers touched in each sweep, shape (sweeps, fingers).
+
+        `lost`: share of single samples that are not read.
+        """
         touching = np.zeros((len(sweeps), 3), dtype=np.bool_)
+        read = np.random.default_rng(2).random(sweeps.shape) >= lost
         for place, counts in enumerate(sweeps):
-            self.feel(counts)
+            if lost:
+                self.feel(np.where(read[place], counts, np.uint16(0)), read[place])
+            else:
+                self.feel(counts)
             touching[place] = self.contact.touching
         return touching
 
@@ -342,3 +366,13 @@ def test_a_hand_that_opens_after_a_long_hold_touches_nothing(held_s: int, drift:
     assert not hand.play(felt(0.0, held_s, held_s + 4.0, drift))[10:].any()
     assert all(hand.contact.tared)
     assert hand.play(felt(300.0, held_s, held_s + 2.0, drift))[10:].all()
+
+
+@pytest.mark.parametrize("lost", [0.01, 0.02, 0.05])
+def test_single_lost_samples_neither_begin_nor_end_a_touch(lost: float) -> None:
+    hand = Hand()
+    assert not hand.play(felt(0.0, 0.0, 3.0), lost).any()
+    assert all(hand.contact.tared)
+    assert hand.play(felt(300.0, 3.0, 8.0), lost)[10:].all()
+    assert not hand.play(felt(0.0, 8.0, 12.0), lost)[10:].any()
+    assert all(hand.contact.tared)

@@ -26,6 +26,12 @@ def every(rows: int) -> Change:
     return lambda stream: stream.iloc[::rows]
 
 
+def held_without_one_electrode(stream: pd.DataFrame) -> pd.DataFrame:
+    """Return `stream` from the first touch on, without values of one electrode."""
+    name = next(name for name in stream.columns if name.startswith("th_"))
+    return stream[REST_ROWS:].assign(**{name: np.nan})
+
+
 def without_thumb(stream: pd.DataFrame) -> pd.DataFrame:
     """Return `stream` with the thumb at rest, as in the first row, with noise of three counts."""
     thumb = [name for name in stream.columns if name.startswith("th_")]
@@ -40,6 +46,7 @@ def without_thumb(stream: pd.DataFrame) -> pd.DataFrame:
         (times(1e-6), "readings are 0 us apart: is the time in seconds, with fractions?"),
         (every(10), "readings are 100 ms apart (10 Hz): a grasp settles from 20 Hz on, or"),
         (lambda stream: stream[REST_ROWS:], "no 100 readings of an open hand come first (1 s at"),
+        (held_without_one_electrode, "(1 s at this rate), or electrodes were not read (200 r"),
         (every(4), "no 100 readings of an open hand come first (4 s at"),
         (lambda stream: stream[: REST_ROWS + 5], "no finger touched: the hand was open"),
         (without_thumb, "th never touched: all required fingers hold a grasp"),
