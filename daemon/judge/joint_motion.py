@@ -40,7 +40,8 @@ class JointMotion:
         self.past: dict[tuple[str, ...], list[tuple[int, NDArray[np.float64]]]] = {}
         """Times, ns, and angles, rad, shape (names,), of each set, oldest first.
 
-        A set is the tuple of names of joints that are sent together.
+        A set is the tuple of names of joints that are sent together, sorted: keys of a JSON object
+        have no order.
         """
         self.latest_ns: dict[tuple[str, ...], int] = {}
         """Time of the last reading of each set, ns."""
@@ -54,14 +55,16 @@ class JointMotion:
     def observe(self, reading: JointReading, t_ns: int) -> None:
         """Take in angles made at `t_ns`, on the same clock as the sweeps.
 
-        A joint whose angle is NaN counts as not sent.
+        A joint whose angle is NaN counts as not sent. If its last one is at most `LATE_NS` old, the
+        whole message counts as not sent, so that its set is judged by the angles before and after.
         """
         valid = ~np.isnan(reading.position_rad)
         if not valid.any():
             return
-        names = tuple(
-            name for name, is_valid in zip(reading.names, valid, strict=False) if is_valid
-        )
+        order = sorted(np.flatnonzero(valid).tolist(), key=reading.names.__getitem__)
+        names = tuple(reading.names[place] for place in order)
+        if len(names) < valid.size and self._lacks_some(names, reading.names, t_ns):
+            return
         if names not in self.past and len(self.past) >= SOURCES_MAX:
             self.past.clear()
             self.latest_ns.clear()
@@ -72,7 +75,7 @@ class JointMotion:
             past.clear()  # time went back, or the joints may have moved in a gap
         self.latest_ns[names] = t_ns
         if not past or t_ns - past[-1][0] >= WINDOW_NS // ANGLES:
-            angles = reading.position_rad[valid]
+            angles = reading.position_rad[order]
             past.append((t_ns, angles))
             del past[: -(ANGLES + 2)]  # one more at each end of the window
             # The first angles of a set are not a change, because sets may come and go.
@@ -112,6 +115,16 @@ class JointMotion:
             not self.past
             and self._waits_since_ns is not None
             and t_ns - self._waits_since_ns > LOST_NS
+        )
+
+    def _lacks_some(self, names: tuple[str, ...], sent: tuple[str, ...], t_ns: int) -> bool:
+        """Return True if a set that came shortly before `t_ns` is `sent`, but with NaN for some.
+
+        `names`: the joints that have angles in the message.
+        """
+        return any(
+            0 <= t_ns - latest_ns <= LATE_NS and set(names) < set(followed) <= set(sent)
+            for followed, latest_ns in self.latest_ns.items()
         )
 
     def _drop_lost(self, t_ns: int) -> None:

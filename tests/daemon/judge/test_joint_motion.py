@@ -183,6 +183,41 @@ def test_eight_sets_of_joints_are_followed_a_ninth_clears_them() -> None:
     assert set(motion.past) == set(motion.latest_ns) == {("J8",)}
 
 
+def test_joints_in_any_order_are_one_set() -> None:
+    for rad_per_s, reason in ((0.0, None), (0.2, Reason.MOVING)):
+        motion, random = JointMotion(), np.random.default_rng(1)
+        for ms in range(0, 1001, 10):
+            angles = {"FFJ1": 0.3, "FFJ2": 1.2 + rad_per_s * ms / 1000, "FFJ3": -0.1, "THJ1": 0.7}
+            order = random.permutation(list(angles)).tolist()
+            send(motion, START_NS + ms * MS, *map(angles.__getitem__, order), names=tuple(order))
+            if ms >= 80:
+                assert motion.objection(START_NS + ms * MS) is reason
+        assert len(motion.past) == 1
+
+
+@pytest.mark.parametrize(("rad_per_s", "reason"), [(0.0, None), (0.105, Reason.MOVING)])
+@pytest.mark.parametrize("valid_every_ms", [20, 100, 140])
+def test_a_joint_that_is_sometimes_null_is_judged_by_its_other_angles(
+    rad_per_s: float, reason: Reason | None, valid_every_ms: int
+) -> None:
+    motion = JointMotion()
+    for ms in range(0, 2001, 10):
+        turned = 1.2 + rad_per_s * ms / 1000
+        send(motion, START_NS + ms * MS, 0.3, np.nan if ms % valid_every_ms else turned, -0.1)
+        if ms >= 200:
+            assert motion.objection(START_NS + ms * MS) is reason
+    assert set(motion.past) == {NAMES}
+
+
+@pytest.mark.parametrize("rad_per_s", [0.0, 0.2])
+def test_a_joint_whose_angle_is_mostly_null_is_never_still(rad_per_s: float) -> None:
+    motion = JointMotion()
+    for ms in range(0, 2001, 10):
+        turned = 1.2 + rad_per_s * ms / 1000
+        send(motion, START_NS + ms * MS, 0.3, np.nan if ms % 160 else turned, -0.1)
+        assert motion.objection(START_NS + ms * MS) in (Reason.MOVING, Reason.JOINTS_LATE)
+
+
 def test_up_to_64_lost_joints_are_remembered_once_each() -> None:
     motion = JointMotion()
     for place in range(140):
