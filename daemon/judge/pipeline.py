@@ -199,6 +199,8 @@ class Pipeline:
 
     def observe_joints(self, reading: JointReading) -> None:
         """Take in joint angles."""
+        if reading.interrupted:
+            self.skip()
         self.hand.observe_joints(reading)
 
     def judge(self, reading: TactileReading) -> Judgement:
@@ -206,6 +208,8 @@ class Pipeline:
 
         Bad data gives `unknown`; it never raises.
         """
+        if reading.interrupted:
+            self.skip()
         if self._to_learn is not None:
             self.learn()
         checked, made_ns = self._health.check(reading), reading.made_ns

@@ -19,12 +19,28 @@ from graspd.models.contract import ModelError
 from tests.daemon.test_library import GIVEN, columns, messages
 
 
-def test_a_stream_is_judged_as_replay_judges_it() -> None:
+def held_streams(folder: Path) -> list[Path]:
+    """Write the demo recording up to a `stable` verdict, and what follows, which begins held."""
+    head, *rows = DEMO_RECORDING.read_text().splitlines(keepends=True)
+    verdicts = [each.verdict.value for each in graspd.judge(DEMO_RECORDING)]
+    cut = verdicts.index("stable") + 20
+    paths = [folder / "before.csv", folder / "after.csv"]
+    for path, part in zip(paths, (rows[:cut], rows[cut : cut + 100]), strict=True):
+        path.write_text("".join([head, *part]))
+    return paths
+
+
+@pytest.mark.parametrize("streams", [lambda _: [DEMO_RECORDING], held_streams], ids=["one", "two"])
+def test_a_stream_is_judged_as_replay_judges_it(
+    streams: Callable[[Path], list[Path]], tmp_path: Path
+) -> None:
+    paths = streams(tmp_path)
     names = "grasp", "judged", "gate", "verdict", "p_slip", "reasons", "motion"
-    expected = [{name: each[name] for name in names} for each in messages(DEMO_RECORDING)]
-    judged = map(msgspec.to_builtins, graspd.judge(DEMO_RECORDING))
+    expected = [{name: each[name] for name in names} for each in messages(*paths)]
+    judged = map(msgspec.to_builtins, graspd.judge(paths))
     got = [{name: each[name] for name in names} for each in judged]
     assert {each["verdict"] for each in got} >= {"stable", "unknown"}
+    assert any("sequence-gap" in each["reasons"] for each in got) is (len(paths) > 1)
     assert got == expected
 
 
