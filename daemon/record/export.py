@@ -3,22 +3,36 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TextIO
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from graspd.biotac import ELECTRODES, electrode_columns
+from graspd.daemon.judge.reasons import Decision
 from graspd.daemon.publish.messages import decode_outcome
 from graspd.daemon.record.mcap_reader import McapReader, RecordedMessage
-from graspd.daemon.record.topics import Judged, Topic, decode_judged
+from graspd.daemon.record.topics import Judged, Said, Topic, decode_judged
 from graspd.daemon.trust.lift_book import GraspId
 from graspd.drivers.base import RecordingError
 from graspd.drivers.recordings.columns import OBJECT, SLIPPED
 from graspd.drivers.recordings.kinds import Kind, kind_of, open_recording
+
+
+class _Verdict(Said, frozen=True, kw_only=True):
+    """Which grasp a verdict is on, and its time."""
+
+    boot_id: str
+    grasp: int
+    t_mono_ns: int
+
+
+_decode_verdict = msgspec.json.Decoder(_Verdict).decode
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,7 +40,7 @@ class Grasp:
     """One grasp: a row of the table."""
 
     counts: NDArray[np.uint16]
-    """Counts last judged before the outcome, shape (fingers, 24)."""
+    """Counts judged before the lift, shape (fingers, 24)."""
     slipped: bool
     object_name: str | None = None
     """Name of the object; None: not reported."""
@@ -34,7 +48,12 @@ class Grasp:
 
 @dataclass(slots=True)
 class Export:
-    """The grasps of some recordings, and the numbers of those left out."""
+    """The grasps of some recordings, and the numbers of those left out.
+
+    A grasp has the counts that were judged last when `lift` was answered yes, maybe again. If no
+    controller asked, those of the first `stable` verdict; if there is none, those judged last. The
+    daemon learns the same (`LiftBook.note`): later counts may be of an object in the air.
+    """
 
     fingers: tuple[str, ...] = ()
     grasps: dict[GraspId, Grasp] = field(default_factory=dict)
@@ -50,19 +69,43 @@ class Export:
     cut_off: int = 0
     """Files that were cut off or are damaged."""
     judged: dict[GraspId, Judged] = field(default_factory=dict)
-    """Last judged counts of each grasp."""
+    """Counts of each grasp, judged before the lift if that is known."""
     told: set[GraspId] = field(default_factory=set)
     """Grasps with an outcome."""
+    _last: tuple[GraspId, Judged] | None = None
+    """Newest judged counts, and their grasp."""
+    _verdict: tuple[GraspId, int] | None = None
+    """Grasp and time, ns, of the last verdict."""
+    _before_ns: dict[GraspId, int] = field(default_factory=dict)
+    """Time, ns, of the verdict on which a grasp may be lifted; later counts may be of a lift."""
 
     def take(self, message: RecordedMessage) -> None:
-        """Add judged counts or an outcome; ignore other messages. Raises `ValueError` or
-        `OverflowError` for a malformed one."""
-        if message.kind == Topic.JUDGED:
-            judgement = decode_judged(message.payload)
-            self.judged[GraspId(judgement.boot_id, judgement.grasp)] = judgement
-        if message.kind != Topic.OUTCOME:
-            return
-        outcome = decode_outcome(message.payload)
+        """Add a verdict, its judged counts, an announced lift or an outcome; ignore other messages.
+        Raises `ValueError` or `OverflowError` for a malformed one."""
+        match message.kind:
+            case Topic.VERDICT:
+                verdict = _decode_verdict(message.payload)
+                grasp = GraspId(verdict.boot_id, verdict.grasp)
+                self._verdict = grasp, verdict.t_mono_ns
+                if verdict.verdict == Decision.STABLE:
+                    self._before_ns.setdefault(grasp, verdict.t_mono_ns)
+            case Topic.JUDGED:
+                judged = decode_judged(message.payload)
+                grasp = GraspId(judged.boot_id, judged.grasp)
+                self._last = grasp, judged
+                # A verdict, and an announced lift on it, come before its counts.
+                if judged.t_mono_ns <= self._before_ns.get(grasp, math.inf):
+                    self.judged[grasp] = judged
+            case Topic.ANNOUNCED if self._verdict is not None:
+                grasp, at_ns = self._verdict
+                self._before_ns[grasp] = at_ns
+                if self._last is not None and self._last[0] == grasp:
+                    self.judged[grasp] = self._last[1]
+            case Topic.OUTCOME:
+                self._tell(message.payload)
+
+    def _tell(self, payload: bytes) -> None:
+        outcome = decode_outcome(payload)
         grasp = GraspId(outcome.grasp_boot_id or outcome.boot_id, outcome.grasp)
         self.told.add(grasp)
         judged = self.judged.get(grasp)

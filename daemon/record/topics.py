@@ -66,7 +66,7 @@ class Judged(msgspec.Struct, frozen=True, kw_only=True):
     t_mono_ns: Count
     """`t_mono_ns` of the verdict: time of the reading's last byte, ns."""
     grasp: Count
-    """Number of the verdict's grasp. The last message on a grasp counts."""
+    """Number of the verdict's grasp. Later messages on a grasp may be of an object in the air."""
     counts: list[list[Count]]
     """Counts by finger and electrode, in the header's order, before repair."""
     repaired: list[str] = []

@@ -20,7 +20,8 @@ from graspd.daemon.publish.messages import OutcomeMessage, encode
 from graspd.daemon.record.export import collect
 from graspd.daemon.record.frames import read_grasps
 from graspd.daemon.record.mcap import McapWriter
-from graspd.daemon.record.topics import Judged, flat
+from graspd.daemon.record.topics import EVENT, Judged, flat
+from graspd.daemon.trust.lift_book import GraspId
 from graspd.drivers.base import ElectrodeFault, RecordingError, TactileReading
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
 from graspd.models.training.data.datasets import read_table
@@ -54,6 +55,16 @@ class Writer:
         )
         content = flat(msgspec.to_builtins(message))
         self._file.write(b"judged.right", msgspec.json.encode(content), self._now_ns)
+
+    def verdict(self, grasp: int, decision: str) -> None:
+        """Write what of a verdict an export reads; 10 ms pass before it."""
+        self._now_ns += 10_000_000
+        said = {"boot_id": self._boot_id, "grasp": grasp, "t_mono_ns": self._now_ns}
+        content = msgspec.json.encode({"v": 1, "verdict": decision, **said})
+        self._file.write(b"verdict.right", content, self._now_ns)
+
+    def announced(self) -> None:
+        self._file.write(b"announced.right", EVENT, self._now_ns)
 
     def outcome(
         self, grasp: int, outcome: Ending, name: str | None = None, judged_by: str | None = None
@@ -121,6 +132,34 @@ def test_the_export_counts_grasps_and_outcomes_left_out(tmp_path: Path) -> None:
     found = collect([tmp_path / "a.mcap"])
     assert [grasp.slipped for grasp in found.grasps.values()] == [True]  # the later counts
     assert (found.without_outcome, found.repaired, found.unjoined) == (2, 1, 1)
+
+
+LIFTS = {
+    "first stable": ("1 stable judged, 1 stable judged", 1),
+    "never stable": ("1 unknown judged, 1 slip judged", 2),
+    "stable later": ("1 unknown judged, 1 stable, 1 stable judged", 1),
+    "asked": ("1 stable judged, 1 stable announced judged, 1 stable judged", 2),
+    "asked later": ("1 stable judged, 1 stable judged, 1 stable announced, 1 slip judged", 2),
+    "asked again": ("1 stable announced judged, 1 stable announced judged, 1 slip judged", 2),
+    "supervised": ("1 unknown announced judged, 1 stable judged", 1),
+    "another": ("1 stable announced judged, 1 stable judged, 2 stable announced", 1),
+}
+"""Verdicts (number of the grasp, decision, what follows); which counts of grasp 1 are its row."""
+
+
+@pytest.mark.parametrize(("verdicts", "lifted"), LIFTS.values(), ids=LIFTS)
+def test_a_grasp_has_its_counts_at_the_lift(tmp_path: Path, verdicts: str, lifted: int) -> None:
+    writer, counts = Writer(tmp_path / "a.mcap"), iter(sweeps(3))
+    for words in map(str.split, verdicts.split(", ")):
+        writer.verdict(int(words[0]), words[1])
+        if "announced" in words:  # the lift was answered before the counts are recorded
+            writer.announced()
+        if "judged" in words:
+            writer.judged(int(words[0]), next(counts))
+    writer.outcome(1, "stable")
+    writer.close()
+    found = collect([tmp_path / "a.mcap"]).grasps[GraspId(BOOT, 1)]
+    assert np.array_equal(found.counts, sweeps(3)[lifted - 1])
 
 
 def test_of_grasps_with_the_same_counts_the_first_is_kept(tmp_path: Path) -> None:
