@@ -25,6 +25,7 @@ from graspd.daemon.scene import scene as kinds
 from graspd.daemon.scene.drivers import Section
 from graspd.daemon.trust.lift_book import GraspId, Report
 from graspd.daemon.trust.trust import FormatError, decode
+from graspd.drivers.base import RecordingError
 from graspd.models.runtime import TactileModel
 
 log = logging.getLogger("graspd")
@@ -46,6 +47,7 @@ LOST_HEADER = (
     "%s: another tool has dropped the record `graspd` (`mcap filter` needs --include-metadata): "
     "judged with the defaults, without session and learning, so verdicts may differ"
 )
+SEVERAL_RUNS = "is of another run than the file before it: replay each run alone"
 
 
 class Same(Companion):
@@ -69,7 +71,10 @@ class RecordedRun(Source):
     """One or more recordings of one run of the daemon, in the order of time."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
-        """Read the headers; warn if a file between them is missing. Raises `RecordingError`."""
+        """Read the headers; warn if a file between them is missing.
+
+        Raises `RecordingError`, also for files of several runs: grasps are known by their numbers.
+        """
         headers = [header_of(path) for path in paths]
         self.header = headers[0]
         self._paths = tuple(paths)
@@ -80,7 +85,10 @@ class RecordedRun(Source):
         self._same_grasps = True
         """False with another gate mode: recorded outcomes then belong to other grasps."""
         for path, header, former in zip(paths[1:], headers[1:], headers, strict=False):
-            if (header.boot_id, header.file) != (former.boot_id, former.file + 1):
+            boot_ids = {header.boot_id, former.boot_id}
+            if len(boot_ids - {""}) > 1:  # without readings a lost header has none
+                raise RecordingError(path, SEVERAL_RUNS)
+            if len(boot_ids) > 1 or header.file != former.file + 1:
                 log.warning("%s: does not continue where the file before it ends", path)
         recorded = self.header.scene
         if not recorded:

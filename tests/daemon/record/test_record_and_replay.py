@@ -22,9 +22,11 @@ from graspd import judge, read_recording
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.recordings import RecordedRun
 from graspd.daemon.publish.messages import encode
+from graspd.drivers.base import RecordingError
 from graspd.models.training.data.datasets import read_table
 from tests.daemon.record.recorded import compared, files, messages, without_null
-from tests.kit.inside import graspd, output
+from tests.daemon.record.test_export import Writer as Written
+from tests.kit.inside import graspd, output, refused
 from tests.process_replay.judging import Case, run
 from tests.process_replay.streams import demo
 
@@ -194,6 +196,17 @@ def test_a_warning_names_a_file_after_a_gap(rotated: Lab, caplog: pytest.LogCapt
     assert not caplog.records
     RecordedRun([first, third])
     assert f"{third}: does not continue where the file before it ends" in caplog.text
+
+
+def test_a_file_of_another_run_is_refused(rotated: Lab, tmp_path: Path) -> None:
+    """Else its grasps are mistaken for those with the same numbers of the run before."""
+    first, second = rotated.files[:2]
+    other = tmp_path / "other.mcap"
+    Written(other, boot_id="f" * 32).close()
+    problem = f"{other}: is of another run than the file before it: replay each run alone"
+    assert problem in refused("replay", first, second, other)
+    with pytest.raises(RecordingError, match="is of another run"):
+        list(judge([first, other]))
 
 
 def test_learning_of_an_older_version_is_left_out_with_warning(
