@@ -19,7 +19,7 @@ from graspd.daemon.publish.companion import Companion, PublishedVerdict
 from graspd.daemon.publish.messages import GateMessage, OutcomeMessage
 from graspd.daemon.record.mcap_reader import header_of
 from graspd.daemon.record.player import McapReplayDriver, RecordedEvent
-from graspd.daemon.record.topics import Late, Said, Topic
+from graspd.daemon.record.topics import Late, Said, TakenBack, Topic
 from graspd.daemon.scene import Scene, SceneError
 from graspd.daemon.scene import scene as kinds
 from graspd.daemon.scene.drivers import Section
@@ -167,8 +167,8 @@ class RecordedRun(Source):
                 pipeline.skip()
             case Topic.ANNOUNCED if self._same_grasps:
                 pipeline.lifts.announce()
-            case Topic.TAKEN_BACK if self._same_grasps:
-                pipeline.lifts.take_back(None)
+            case TakenBack(boot_id, number) if self._same_grasps:
+                pipeline.lifts.take_back(None if number is None else GraspId(boot_id, number))
             case Late():
                 pipeline.expect_late(judged=event.judged)
             case Said():

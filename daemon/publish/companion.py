@@ -58,7 +58,7 @@ class LoopEvent(Enum):
     ANNOUNCED = "announced"
     """A controller asked whether it may lift, and the answer was `stable` or `supervised`."""
     TAKEN_BACK = "taken-back"
-    """No lift follows the last announcement."""
+    """No lift follows an announcement."""
 
 
 class PublishedVerdict(NamedTuple):
@@ -110,8 +110,8 @@ class Companion:
     def on_reading(self, reading: Reading) -> None:
         """A reading has come. A tactile one is judged, or skipped, after this call."""
 
-    def on_event(self, event: LoopEvent) -> None:
-        """An event has come before the next reading."""
+    def on_event(self, event: LoopEvent, grasp: GraspId | None = None) -> None:
+        """An event has come before the next reading. `grasp`: the announced one, if any."""
 
     def on_verdict(self, published: PublishedVerdict) -> None:
         """A verdict was published."""

@@ -15,12 +15,14 @@ from graspd.daemon.record.topics import (
     PLAYED,
     Late,
     Said,
+    TakenBack,
     Topic,
     boot_id_of,
     decode_exchanged,
     decode_gate,
     decode_late,
     decode_said,
+    decode_taken_back,
     joint_reading,
     tactile_reading,
 )
@@ -30,9 +32,9 @@ from graspd.drivers.recordings.player import ReadingsDriver, within_limits
 
 _log = logging.getLogger(__name__)
 
-RecordedEvent = Topic | OutcomeMessage | Exchanged | Late | GateMessage | Said
-"""An event of `EVENTS`, an outcome or an exchange of sensors. `Late`, `GateMessage` and `Said` are
-about the next reading: it was late, it changed the gate, or its verdict."""
+RecordedEvent = Topic | OutcomeMessage | Exchanged | TakenBack | Late | GateMessage | Said
+"""An event of `EVENTS`, a lift taken back, an outcome or an exchange of sensors. `Late`,
+`GateMessage` and `Said` are about the next reading: late, a change of the gate, its verdict."""
 _Item = Reading | RecordedEvent
 LATE = b'{"judged":false}'
 """Content of the `late` message played before a reading that may have been late."""
@@ -127,6 +129,8 @@ class McapReplayDriver(ReadingsDriver[_Item]):
                     return decode_outcome(message.payload)
                 case Topic.EXCHANGED:
                     return decode_exchanged(message.payload)
+                case Topic.TAKEN_BACK:
+                    return decode_taken_back(message.payload)
                 case Topic.LATE:
                     return decode_late(message.payload)
                 case Topic.GATE:

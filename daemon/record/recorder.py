@@ -28,9 +28,10 @@ from graspd.daemon.record.mcap import (
     make_room,
     rotate_bytes,
 )
-from graspd.daemon.record.topics import EVENT, Joints, Judged, Late, Topic, flat
+from graspd.daemon.record.topics import EVENT, Joints, Judged, Late, TakenBack, Topic, flat
 from graspd.daemon.record.viewers import Viewer
 from graspd.daemon.scene.scene import Record
+from graspd.daemon.trust.lift_book import GraspId
 from graspd.drivers.base import JointReading, Reading
 
 if TYPE_CHECKING:
@@ -157,10 +158,12 @@ class Recorder(Companion):
             making = partial(Judged.of, self._boot_id, judgement)
             self._put(self._names[Topic.JUDGED], making)
 
-    def on_event(self, event: LoopEvent) -> None:
+    def on_event(self, event: LoopEvent, grasp: GraspId | None = None) -> None:
         """Record an event. Equal events in a row are recorded once, except `TAKEN_BACK`."""
         topic = self._names[Topic(event.value)]
-        if topic != self._last_topic or event is LoopEvent.TAKEN_BACK:
+        if event is LoopEvent.TAKEN_BACK and grasp is not None:
+            self._put(topic, partial(TakenBack, *grasp))
+        elif topic != self._last_topic or event is LoopEvent.TAKEN_BACK:
             self._put(topic, EVENT)
 
     def on_status(self, status: Status) -> None:

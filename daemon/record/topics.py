@@ -99,6 +99,14 @@ class Said(msgspec.Struct, frozen=True):
     judged: bool = True
 
 
+class TakenBack(msgspec.Struct, frozen=True):
+    """Mark that no lift follows an announcement. An old recording does not say of which grasp:
+    of the newest that was announced."""
+
+    boot_id: str = ""
+    grasp: int | None = None
+
+
 class Event(msgspec.Struct, frozen=True):
     """An event; its topic is its kind."""
 
@@ -127,7 +135,7 @@ class Topic(StrEnum):
     ANNOUNCED = "announced"
     """A controller asked if it may lift, and the answer was `stable` or `supervised`."""
     TAKEN_BACK = "taken-back"
-    """No lift follows the last announcement."""
+    """No lift follows an announcement."""
     # Made from these for viewers:
     IMAGE = "image"
     LOG = "log"
@@ -143,18 +151,26 @@ MESSAGES: Final[dict[str, type[msgspec.Struct]]] = {
     "dropped": Event,
     "skipped": Event,
     "announced": Event,
-    "taken-back": Event,
+    "taken-back": TakenBack,
     "image": RawImage,
     "log": Log,
 }
 """Type of the messages by the first part of their topic."""
-EVENTS: Final = (Topic.ASKED, Topic.SKIPPED, Topic.ANNOUNCED, Topic.TAKEN_BACK)
-PLAYED: Final = (*EVENTS, Topic.TACTILE, Topic.JOINTS, Topic.OUTCOME, Topic.EXCHANGED)
+EVENTS: Final = (Topic.ASKED, Topic.SKIPPED, Topic.ANNOUNCED)
+PLAYED: Final = (
+    *EVENTS,
+    Topic.TACTILE,
+    Topic.JOINTS,
+    Topic.OUTCOME,
+    Topic.EXCHANGED,
+    Topic.TAKEN_BACK,
+)
 """Topics that a replay plays in their order; it plays `late`, `gate` and `verdict` before their
 reading, and `dropped` as `skipped`."""
 EVENT: Final = b"{}"
 
 decode_exchanged = msgspec.json.Decoder(Exchanged).decode
+decode_taken_back = msgspec.json.Decoder(TakenBack).decode
 decode_late = msgspec.json.Decoder(Late).decode
 decode_gate = msgspec.json.Decoder(messages.GateMessage).decode
 decode_said = msgspec.json.Decoder(Said).decode

@@ -310,9 +310,9 @@ class Loop:
         """Return the time without a reading, ns, after which silence is reported."""
         return max(self._max_age_ns, SILENCE_PERIODS * (self._tactile.period_ns or 0))
 
-    def _announced(self, announced: bool) -> None:
+    def _announced(self, grasp: GraspId, announced: bool) -> None:
         for on_event in self._on_event:
-            on_event(LoopEvent.ANNOUNCED if announced else LoopEvent.TAKEN_BACK)
+            on_event(LoopEvent.ANNOUNCED if announced else LoopEvent.TAKEN_BACK, grasp)
 
     def _send_status(self) -> None:
         now_ns = self._clock()

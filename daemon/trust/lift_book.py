@@ -120,9 +120,9 @@ class LiftBook:
         """Oldest first."""
         self.lifter: Peer | None = None
         """Last peer that was answered that it may lift a grasp; None: none since the start."""
-        self.on_announced: Callable[[bool], None] = lambda _announced: None
-        """Called with True after `announce` changed anything, with False after an announcement was
-        taken back. A recording has these calls, so that its replay learns the same."""
+        self.on_announced: Callable[[GraspId, bool], None] = lambda _grasp, _announced: None
+        """Called with True after `announce` changed anything of a grasp, with False after its
+        announcement was taken back. A recording has these calls, so its replay learns the same."""
         self._judged: tuple[GraspId, bytes] | None = None
         """Grasp judged last, and its features when it was judged last after settling."""
         self._offered: GraspId | None = None
@@ -228,7 +228,7 @@ class LiftBook:
         if not lift.announced and lift.stable:
             self.announced += 1
             self._count()
-        self.on_announced(True)
+        self.on_announced(lift.id, True)
 
     def take_back(self, grasp: GraspId | None) -> bool:
         """Note that no lift of a grasp follows, and remove its owner. None: the newest announced
@@ -244,7 +244,7 @@ class LiftBook:
         if lift.announced:
             self.announced -= 1
             self._count()
-            self.on_announced(False)
+            self.on_announced(lift.id, False)
         return True
 
     def offered(self, peer: Peer) -> GraspId | None:

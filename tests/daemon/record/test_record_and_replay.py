@@ -22,6 +22,9 @@ from graspd import judge, read_recording
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.recordings import RecordedRun
 from graspd.daemon.publish.messages import encode
+from graspd.daemon.record.player import McapReplayDriver
+from graspd.daemon.record.topics import TakenBack
+from graspd.daemon.trust.lift_book import GraspId
 from graspd.drivers.base import RecordingError
 from graspd.models.training.data.datasets import read_table
 from tests.daemon.record.recorded import compared, files, messages, without_null
@@ -207,6 +210,22 @@ def test_a_file_of_another_run_is_refused(rotated: Lab, tmp_path: Path) -> None:
     assert problem in refused("replay", first, second, other)
     with pytest.raises(RecordingError, match="is of another run"):
         list(judge([first, other]))
+
+
+def test_a_replay_takes_back_the_lift_that_the_run_did(rotated: Lab) -> None:
+    """Recordings from before say only that one was: the newest."""
+    run = RecordedRun(rotated.files[:1])
+    wanted, boot_id = run.scene({}, {}, None), run.header.boot_id
+    parts = run.parts(wanted, assembly.load_model(wanted), None)
+    (driver,), book = parts.drivers, parts.pipeline.lifts
+    assert isinstance(driver, McapReplayDriver)
+    assert driver.on_event is not None
+    for grasp in (1, 2, 3):
+        book.note(GraspId(boot_id, grasp), b"", stable=True)
+        book.announce()
+    for event, awaited in ((TakenBack(boot_id, 1), [2, 3]), (TakenBack(), [2])):
+        driver.on_event(event)
+        assert [lift.id.grasp for lift in book.state().records if lift.is_awaited] == awaited
 
 
 def test_learning_of_an_older_version_is_left_out_with_warning(

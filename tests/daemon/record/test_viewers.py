@@ -16,12 +16,13 @@ from graspd.daemon.judge.exchange import Exchanged
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
 from graspd.daemon.publish.companion import LoopEvent
 from graspd.daemon.record.player import McapReplayDriver
-from graspd.daemon.record.topics import Topic, flat, schemas
+from graspd.daemon.record.topics import TakenBack, Topic, flat, schemas
 from graspd.daemon.record.viewers import INFO, SCALE, WARNING, Viewer
+from graspd.daemon.trust.lift_book import GraspId
 from graspd.models.layout import D1
 from graspd.models.session_statistics import SessionState
 from graspd.models.trust.learner import LearnerState
-from tests.daemon.record.recorded import files, recorder
+from tests.daemon.record.recorded import BOOT, files, recorder
 from tests.daemon.watch.watch_fakes import tactile, verdict
 
 PLAIN = ("boolean", "string", "number", "integer")
@@ -184,16 +185,19 @@ ASKED, SKIPPED = Topic.ASKED, Topic.SKIPPED
         ([ASKED, ASKED], [ASKED]),  # questions in a row are one
         ([ASKED, SKIPPED, ASKED], [ASKED, SKIPPED, ASKED]),
         ([ASKED, KNOWN, ASKED], [ASKED, KNOWN, ASKED]),
+        ([TakenBack(BOOT, 1), TakenBack(BOOT, 2)], [TakenBack(BOOT, 1), TakenBack(BOOT, 2)]),
     ],
-    ids=["in a row", "around a loss", "around an exchange"],
+    ids=["in a row", "around a loss", "around an exchange", "taken back"],
 )
 def test_events_are_replayed_in_order_and_repeated_questions_once(
-    tmp_path: Path, events: list[Topic | Exchanged], recorded: list[Topic | Exchanged]
+    tmp_path: Path, events: list[Topic | Exchanged | TakenBack], recorded: list[object]
 ) -> None:
     writing = recorder(tmp_path)
     for event in events:
         if isinstance(event, Exchanged):
             writing.exchanged(event)
+        elif isinstance(event, TakenBack):
+            writing.on_event(LoopEvent.TAKEN_BACK, GraspId(event.boot_id, event.grasp or 0))
         else:
             writing.on_event(LoopEvent(event))
     writing.send(b"tactile.right", tactile(0, *REST.tolist()))

@@ -186,7 +186,7 @@ class Peer(Companion):
         requests.ask()
         requests.outcome(Report(GraspId(self.boot_id, 1), "slip", "mug"), self.refused.append)
 
-    def on_event(self, event: LoopEvent) -> None:
+    def on_event(self, event: LoopEvent, grasp: GraspId | None = None) -> None:
         self.heard.append(event)
 
     def on_outcome(self, report: Report) -> None:

@@ -17,6 +17,7 @@ from graspd.daemon.judge.reasons import Decision, Reason
 from graspd.daemon.publish.companion import LoopEvent
 from graspd.daemon.run.loop import DRAINS_MAX, LoopTiming
 from graspd.daemon.run.overload import YIELD_MAX_NS, mark_repeats
+from graspd.daemon.trust.lift_book import GraspId
 from graspd.drivers.base import ElectrodeFault, JointReading, Reading, TactileReading
 from tests.daemon.fakes import MS, Clock, FakeDriver, reading, sound
 from tests.daemon.judge.felt_hand import POSES
@@ -47,7 +48,7 @@ class OverloadedLoop(LoopBench):
         if isinstance(reading, JointReading):
             self.angles.append(reading.seq)
 
-    def on_event(self, event: LoopEvent) -> None:
+    def on_event(self, event: LoopEvent, grasp: GraspId | None = None) -> None:
         self.gaps += event is LoopEvent.SKIPPED
 
 

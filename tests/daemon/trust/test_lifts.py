@@ -129,8 +129,8 @@ class Lifts(RuleBasedStateMachine):
     def start(self, alpha: float | None, most: int) -> None:
         self.most, self.number, self.late = most, 0, 0
         self.model, self.part = Model(alpha), trust(RiskLimits(alpha, outstanding_max=most))
-        self.heard, self.expected = list[bool](), list[bool]()
-        self.part.lifts.on_announced = self.heard.append
+        self.heard, self.expected = list[object](), list[object]()
+        self.part.lifts.on_announced = lambda *told: self.heard.append(told)
         self.save()
 
     @rule()
@@ -192,7 +192,9 @@ class Lifts(RuleBasedStateMachine):
             lift.lesson = self.model.newest[1]
         lift.announced = lift.stable
         self.model.announced += lift.announced - before[2]
-        self.expected += [True] * (before != (self.number, lift.lesson, lift.announced))
+        self.expected += [(named(self.number), True)] * (
+            before != (self.number, lift.lesson, lift.announced)
+        )
 
     @rule(back=st.none() | BACK)
     def take_back(self, back: int | None) -> None:
@@ -203,7 +205,7 @@ class Lifts(RuleBasedStateMachine):
         assert self.part.lifts.take_back(grasp) is is_open
         if lift is not None and is_open:
             self.model.announced -= lift.announced
-            self.expected += [False] * lift.announced
+            self.expected += [(named(number), False)] * lift.announced
             lift.announced, lift.owner = False, None
 
     @rule(back=BACK, slipped=st.booleans())
@@ -244,7 +246,7 @@ class Lifts(RuleBasedStateMachine):
     def begin(self, data: bytes) -> None:
         self.part = trust(RiskLimits(self.model.alpha, outstanding_max=self.most))
         self.part.restore(decode(data))
-        self.part.lifts.on_announced = self.heard.append
+        self.part.lifts.on_announced = lambda *told: self.heard.append(told)
         self.model.lifter, self.model.newest, self.model.offered = None, (0, b""), 0
 
     @rule(alpha=ALPHAS)
