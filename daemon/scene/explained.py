@@ -18,7 +18,7 @@ SCHEMA = "scene.schema.json"
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 INTRODUCTION = """# The scene, key by key
 
-This page is for those who write a scene: one TOML file, in which only `[tactile]` must be there.
+For those who write a scene: one TOML file, in which only `[tactile]` must be there.
 `graspd scene --example spi > right.toml` prints one to edit, and `graspd check right.toml` finds
 mistakes. Editors with Taplo (VS Code: Even Better TOML) complete the keys.
 
