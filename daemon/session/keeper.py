@@ -381,10 +381,14 @@ def is_of_sensors(one: KeptSession, other: KeptSession) -> bool:
 
 
 def newest_of_each(kept: Sequence[KeptSession]) -> list[KeptSession]:
-    """Return the first session of each set of fingers, model and sensors."""
+    """Return the first session of each set of fingers, model and sensors; an empty one only where
+    all are. They stand where the first of their set did."""
     newest: list[KeptSession] = []
     for each in kept:
-        of_model = [one for one in newest if one.model == each.model]
-        if not any(is_of_sensors(one, each) for one in of_model):
+        of_model = [n for n, one in enumerate(newest) if one.model == each.model]
+        same = next((n for n in of_model if is_of_sensors(newest[n], each)), None)
+        if same is None:
             newest.append(each)
+        elif newest[same].is_empty and not each.is_empty:  # one that was unreadable at its start
+            newest[same] = each
     return newest

@@ -158,6 +158,29 @@ def test_the_session_of_a_start_without_readings_continues(
     assert later.state() == part.state()
 
 
+@pytest.mark.parametrize(("sensor", "continued"), [("A", 30), ("B", 0)])
+def test_an_empty_session_continues_only_without_another_of_its_sensors(
+    folder: SessionFolder, sensor: str, continued: int
+) -> None:
+    """The session of sensor A cannot be read at one start, with `sensor`, and can at the next."""
+    path, session, again = folder.path / "1.session", calibration(), calibration()
+    keeper = session_keeper(session, sensors(ff="A"), folder, part=trust())
+    read_once(keeper)
+    observe(session, 30)
+    keeper.save()
+    kept = path.read_bytes()
+    path.write_bytes(b"?")
+    keeper = session_keeper(calibration(), sensors(ff=sensor), folder, part=trust())
+    read_once(keeper)
+    keeper.save()
+    path.write_bytes(kept)
+    keeper = session_keeper(again, sensors(ff=sensor), folder, part=trust())
+    assert again.grasps == continued
+    read_once(keeper)
+    keeper.save()
+    assert max(each.grasps for each in kept_in(folder.path)) == 30
+
+
 def test_a_folder_that_cannot_be_made_is_tried_again(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

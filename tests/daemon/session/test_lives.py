@@ -83,7 +83,9 @@ class Model:
     def newest_of_each(self, sessions: list[Session]) -> list[Session]:
         newest: dict[tuple[str, str], Session] = {}
         for each in sessions:
-            newest.setdefault((each.model, each.sensor), copy(each))
+            key = each.model, each.sensor
+            if key not in newest or (newest[key].is_empty and not each.is_empty):
+                newest[key] = copy(each)  # in the place of the empty one
         return list(newest.values())
 
     def start(self, model: str, *, is_spoiled: bool) -> None:
