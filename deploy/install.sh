@@ -227,10 +227,10 @@ END
 check_wheelhouse() {
     [ -d "$wheelhouse" ] || fail "$wheelhouse is not a folder"
     wheelhouse=$(cd -- "$wheelhouse" && pwd)
-    for wheel in "$wheelhouse"/graspd-*.whl; do
-        [ -f "$wheel" ] ||
-            fail "$wheelhouse has no wheel of graspd: pip wheel -w $wheelhouse $source"
-    done
+    set -- "$wheelhouse"/graspd-*.whl
+    [ -f "$1" ] || fail "$wheelhouse has no wheel of graspd: pip wheel -w $wheelhouse $source"
+    # pip would take the highest, also where a lower one was made to go back to.
+    [ $# = 1 ] || fail "$wheelhouse has several wheels of graspd: leave the one to install"
 }
 
 install_all() {

@@ -145,6 +145,17 @@ def test_a_failed_upgrade_leaves_the_former_version_unchanged(
     assert version_below(staged) == "graspd 0.1.0"
 
 
+def test_several_wheels_of_graspd_are_refused(staged: Path, tmp_path: Path) -> None:
+    wheels, before = wheelhouse(tmp_path / "both", "0.2.0"), content(staged)
+    older = next(wheelhouse(tmp_path / "older", "0.1.0").iterdir())
+    older.rename(wheels / older.name)
+    done = installer("--root", staged, "--wheelhouse", wheels)
+    assert done.returncode == 1
+    refused = f"graspd: {wheels} has several wheels of graspd: leave the one to install\n"
+    assert done.stderr.endswith(refused)
+    assert content(staged) == before
+
+
 def test_an_uninstall_leaves_the_scenes_and_what_was_learned(staged: Path) -> None:
     session = staged / "var/lib/graspd/right.session/1.session"
     session.parent.mkdir(parents=True)
