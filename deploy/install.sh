@@ -319,7 +319,8 @@ inputs() {
         (cd -- "$wheelhouse" && sha256sum -- *.whl)
     else
         (cd -- "$source" && find pyproject.toml README.md LICENSE daemon drivers models \
-            deploy/package deploy/clients/python -type f ! -path '*/__pycache__/*' -exec sha256sum {} +) >"$scratch/sources"
+            deploy/package deploy/clients/python deploy/scenes deploy/shell \
+            -type f ! -path '*/__pycache__/*' -exec sha256sum {} +) >"$scratch/sources"
         sort -k 2 "$scratch/sources"
     fi
 }

@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from tests.deploy.staging import (
     version_below,
     wheelhouse,
 )
+from tests.kit.programs import ran
 
 FILES = {
     "/usr/local/bin/graspd",
@@ -86,6 +88,18 @@ def test_a_second_run_changes_nothing_and_says_so(staged: Path, wheels: Path) ->
     before = content(staged)
     assert install(staged, wheels) == "graspd: nothing to change in /opt/graspd\n"
     assert content(staged) == before
+
+
+def test_a_change_of_any_file_in_the_wheel_is_noticed(tmp_path: Path) -> None:
+    """The installer lists what it compares; pyproject.toml says what goes into the wheel."""
+    functions = INSTALLER.read_text().removesuffix('main "$@"\n')
+    script = f"{functions}\npython=$1 source=$2 scratch=$3\ninputs\n"
+    listed = ran("sh", "-c", script, INSTALLER, sys.executable, DEPLOY.parent, tmp_path, check=True)
+    compared = {line.rpartition("  ")[2] for line in listed.stdout.splitlines()}
+    project = tomllib.loads((DEPLOY.parent / "pyproject.toml").read_text())
+    wheel = project["tool"]["hatch"]["build"]["targets"]["wheel"]
+    for part in (*wheel["only-include"], *wheel["force-include"], *wheel["shared-data"]):
+        assert [path for path in compared if path == part or path.startswith(f"{part}/")], part
 
 
 def test_a_scene_is_never_overwritten(staged: Path, wheels: Path) -> None:
