@@ -79,10 +79,10 @@ def load(path: Path) -> KeptSession:
         plain = zlib.decompressobj().decompress(content, MAX_BYTES)
         kept = msgspec.msgpack.decode(plain, type=KeptSession)
         return kept if kept.trust is None else replace(kept, trust=of_this_format(kept.trust))
+    except (msgspec.ValidationError, ValueError) as error:  # whole, for its checksum is right
+        raise SessionFileError(f"{path}: of another version of graspd: {error}") from error
     except (zlib.error, msgspec.DecodeError, RecursionError) as error:
         raise SessionFileError(f"{path}: not a session: {error}") from error
-    except ValueError as error:
-        raise SessionFileError(f"{path}: not a session of this graspd: {error}") from error
 
 
 def write(path: Path, kept: KeptSession) -> None:

@@ -144,6 +144,7 @@ def test_a_file_damaged_at_any_place_is_refused(place: int, value: int, kind: st
         sealed(b"\x91" * 100_000),
         sealed(bytes(16 << 20)),
         sealed(msgspec.msgpack.encode({"version": 2})),
+        sealed(msgspec.msgpack.encode({"version": 4})),
         sealed(msgspec.msgpack.encode({"version": 3, "grasps": 1})),
         sealed(
             msgspec.msgpack.encode(
@@ -151,14 +152,14 @@ def test_a_file_damaged_at_any_place_is_refused(place: int, value: int, kind: st
             )
         ),
     ],
-    ids=["nested", "huge", "former", "no session", "other learning"],
+    ids=["nested", "huge", "former", "newer", "no session", "other learning"],
 )
-def test_a_file_with_right_checksum_but_wrong_content_is_refused(
+def test_wrong_content_with_right_checksum_is_of_another_version(
     tmp_path: Path, spoiled: bytes
 ) -> None:
     path = tmp_path / "1.session"
     path.write_bytes(spoiled)
-    with pytest.raises(SessionFileError, match="not a session"):
+    with pytest.raises(SessionFileError, match="of another version of graspd"):
         load(path)
 
 
