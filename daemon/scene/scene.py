@@ -196,7 +196,7 @@ class Record(Section):
     directory: FilePath | None = None
     """Folder of the files; without it `/var/lib/graspd/record`."""
     keep_mb: Annotated[float, Field(ge=1.0, le=10_000_000.0), unit("MB")] = 4096.0
-    """Largest size of all files of this hand together."""
+    """Largest size of all files of this hand together; at most 1000 recordings."""
     raw: bool = False
     """True: also record the link: CAN frames (candump text) or serial bytes."""
 
