@@ -1,6 +1,6 @@
-"""Serial ports without `select`, which fails for descriptors of 1024 and more.
+"""Serial ports without `select`, which fails for descriptors of 1024 and more. Nothing waits.
 
-The module's name makes it pyserial's handler of `polled://PATH`.
+Once it is imported, the module is, by its name, pyserial's handler of `polled://PATH`.
 """
 
 from __future__ import annotations

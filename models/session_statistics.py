@@ -156,7 +156,10 @@ class SessionStatistics:
         self._settle()
 
     def _balance(self, slip: bool | None) -> float:
-        """Count the verdict of the next grasp; return the grasp's weight."""
+        """Return the weight of the next grasp, and count its verdict from the 21st grasp on.
+
+        The weight is below 1 if most are slips and this grasp was not judged stable.
+        """
         if self.grasps < BALANCED_FROM:
             return 1.0
         if slip is not None:

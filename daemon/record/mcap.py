@@ -78,7 +78,10 @@ class RecordingHeader(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RecordingFile:
-    """One file that is being written. Methods raise `OSError` if the disk fails."""
+    """File of any bytes, such as a link log, that is being written; base of `McapWriter`.
+
+    Methods raise `OSError` if the disk fails, except `abandon` and `remove`.
+    """
 
     def __init__(self, path: Path) -> None:
         """Create the file, which must not exist."""
@@ -166,7 +169,8 @@ class McapWriter(RecordingFile):
 def make_room(options: Record, hand: str, stamp: str) -> int:
     """Delete the hand's oldest recordings until the file with `stamp` fits; return their number.
 
-    The link log of a recording is deleted with it. Raises `OSError`.
+    `stamp`: time, run and number, as in the names of files. The link log of a recording is deleted
+    with it. Raises `OSError`.
     """
     options.folder.mkdir(parents=True, exist_ok=True)
     recordings = _recordings(options.folder, hand)

@@ -208,7 +208,10 @@ class _Bag:
         return found[0] if found else None
 
     def messages(self) -> Iterator[tuple[int, Any]]:
-        """Yield times, ns, and messages of both topics. Raises `RecordingError` for damage."""
+        """Yield time, ns, and message of both topics, in the order of the bag.
+
+        The time is the header's, or the bag's if that is 0. Raises `RecordingError` for damage.
+        """
         read = {(each.topic, each.msgtype) for each in (self.tactile, self.joints) if each}
         everything = self._reader.connections
         chosen = [each for each in everything if (each.topic, each.msgtype) in read]

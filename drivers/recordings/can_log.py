@@ -82,7 +82,8 @@ def bus_name(channel: str) -> str:
 
 
 def read_log(path: Path) -> Iterator[Line]:
-    """Yield the lines of a CAN log of any kind. Raises `RecordingError`."""
+    """Yield the lines of a CAN log of any kind, those that are not understood too. Raises
+    `RecordingError` if the file is of another kind or cannot be read."""
     kind = kind_of(path)
     with open_recording(path) as stream:
         if kind is Kind.BLF:

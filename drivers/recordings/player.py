@@ -115,7 +115,8 @@ class RecordedDriver(Opened, Generic[Item]):
         return item
 
     def hand_over(self, made: Reading, at_ns: int) -> Reading:
-        """Return the reading `made`, which was complete at `at_ns`, as if `at_ns` were now."""
+        """Return the reading `made`, which was complete at `at_ns`, as if `at_ns` were now; its
+        `recorded_ns` is the time that it had."""
         self.handed_over_ns = self._clock()
         t_ns = self.handed_over_ns - (at_ns - made.t_ns)
         return msgspec.structs.replace(made, t_ns=t_ns, recorded_ns=made.t_ns)

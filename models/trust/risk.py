@@ -58,7 +58,7 @@ class RiskLimits:
 
 
 class RiskState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """State of a `Risk`: its attributes of these names, and the share of its limits."""
+    """State of a `Risk`: its attributes of these names, and the share of slips that was allowed."""
 
     max_slip_when_stable: float | None
     lifts: Count

@@ -1,4 +1,7 @@
-"""Steps of the system test: faults, and the time until verdicts come again."""
+"""Steps of the system test: faults, and the time until verdicts come again.
+
+Each returns what it saw, and raises `StepError` if graspd did something else.
+"""
 
 from __future__ import annotations
 

@@ -74,7 +74,8 @@ class Trained:
         return _moved(values, self.sensors.prior, self.sensors.each(table_of))
 
     def takes(self, sharpness: Sequence[Sharpness] = (Sharpness(0.0, 1.0),)) -> Input:
-        """Return the input for a contract; only a session system uses `sharpness`."""
+        """Return the input for a contract. `sharpness`: temperatures by the age of a session; only
+        a session system uses them."""
         if not isinstance(self.system.input, SessionFeatures):
             return self.system.input
         if self.standards is None:

@@ -34,7 +34,7 @@ ROWS = list(read_rows(DEMO_TABLE, FINGERS))
 
 
 def seed(path: Path, recording: Path) -> TrustState:
-    """Seed the session from a recording; return what it has learned."""
+    """Seed the session of the scene `path` from a recording; return what it has learned."""
     output("session", "seed", path, recording)
     kept = last_kept(path.with_name("right"))
     assert kept.trust is not None

@@ -23,7 +23,7 @@ CAN = "[tactile]\ndriver = 'can'\n"
 PALM = "[tactile]\ndriver = 'palm'\nsource = 'udp://127.0.0.1:5555'\n"
 
 
-def test_the_smallest_scene_has_the_documented_defaults(tmp_path: Path) -> None:
+def test_a_scene_without_hand_publish_or_gate_gets_their_defaults(tmp_path: Path) -> None:
     scene = load(written(tmp_path, GOOD))
     assert scene.hand.fingers == ("ff", "mf", "th")
     assert scene.endpoint == "ipc:///run/graspd/right.ipc"

@@ -191,7 +191,7 @@ def test_a_silent_board_is_down_and_comes_back(monkeypatch: pytest.MonkeyPatch) 
         ),
     ],
 )
-def test_each_interfaces_stamps_date_frames(
+def test_frames_are_dated_as_their_kind_of_interface_stamps_them(
     interface: str,
     steps: list[tuple[int, int, tuple[float, ...]]],
     expected: list[tuple[int, int]],

@@ -164,7 +164,7 @@ def words_of(conversation: Conversation) -> dict[str, str]:
         (("", "", ""), (0, 0, 0), Fact("none, none, none", DeviceFault.NO_SENSOR), Fact("-, -, -")),
     ],
 )
-def test_absent_duplicate_or_misread_sensors_are_described_as_faults(
+def test_absent_or_duplicate_sensors_and_damaged_words_are_faults(
     serials: tuple[str, ...], numbers: tuple[int, ...], sensors: Fact, errors: Fact
 ) -> None:
     conversation = greeted(dataclasses.replace(hello(0), serials=serials))

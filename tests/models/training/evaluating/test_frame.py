@@ -53,7 +53,7 @@ with LocalCluster(
 
 @contextlib.contextmanager
 def cluster() -> Iterator[str]:
-    """The address of a scheduler and its worker, in a process of their own."""
+    """Run a scheduler and its worker in another process during the block. Yields the address."""
     words = [sys.executable, "-c", CLUSTER]
     with subprocess.Popen(
         words, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE
