@@ -21,7 +21,7 @@ from graspd.models.training.commands.common import (
     say,
     whole,
 )
-from graspd.models.training.data.datasets import DatasetError
+from graspd.models.training.data.datasets import DatasetError, lab_table_names
 from graspd.models.training.data.protocols import FOLDS, TooFewGraspsError
 from graspd.models.training.systems.registry import SYSTEMS
 
@@ -73,19 +73,20 @@ def run(args: argparse.Namespace) -> int:
     from graspd.models.training.evaluating.frame import LostWorkerError
     from graspd.models.training.making.export import ExportError
 
-    plan = _plan(args)
-    out: Path = args.out or Path("runs") / plan.model
-    return exit_code("train", out, lambda: _train(args, plan, out), ExportError, LostWorkerError)
+    folder: Path = args.out or Path("runs")
+    return exit_code("train", folder, lambda: _train(args), ExportError, LostWorkerError)
 
 
-def _train(args: argparse.Namespace, plan: TrainingPlan, out: Path) -> None:
+def _train(args: argparse.Namespace) -> None:
     from graspd.models.training.making.make_model import EXTRA_TRAININGS, make_model
     from graspd.models.training.making.plan import limits, preflight, with_enough_folds
 
     started_s = time.monotonic()
+    grasps = read_grasps("train", args)
+    plan = _plan(args, lab_table_names(grasps.files))
+    out: Path = args.out or Path("runs") / plan.model
     if args.own and plan.model in zoo.names():
         raise WrongInputError(f"graspd ships a model {plan.model!r}: choose another --name")
-    grasps = read_grasps("train", args)
     check_fingers([plan.system], grasps)
     if args.data is not None:
         there = {file.name for file in grasps.files}
@@ -119,10 +120,11 @@ def _train(args: argparse.Namespace, plan: TrainingPlan, out: Path) -> None:
         say("train", f"for a scene, below [model]: path = {json.dumps(str(file.absolute()))}")
 
 
-def _plan(args: argparse.Namespace) -> TrainingPlan:
+def _plan(args: argparse.Namespace, lab: tuple[str, ...]) -> TrainingPlan:
+    """Return the plan of the command line; `lab`: names of its own tables, as the grasps have."""
     from graspd.models.training.making.plan import TrainingPlan
 
-    system, lab = SYSTEMS[args.model], tuple(path.stem for path in args.own)
+    system = SYSTEMS[args.model]
     if lab:
         published = () if args.data is None else system.tables
         system = dataclasses.replace(system, tables=(*published, *lab))

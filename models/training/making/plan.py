@@ -7,7 +7,6 @@ import re
 import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -57,7 +56,8 @@ class TrainingPlan:
         """Name of the model and of its files, such as small-session or small-session-monday."""
         if self.name is not None:
             return self.name
-        words = "-".join((self.system.name, *(Path(name).stem for name in self.lab_files)))
+        own = set(self.system.tables).difference(table.name for table in TABLES)
+        words = "-".join((self.system.name, *filter(own.__contains__, self.system.tables)))
         return re.sub(r"[^A-Za-z0-9._]+", "-", words)[:NAME_MAX].rstrip("-.")
 
     def protocols(self, grasps: Grasps) -> tuple[EvalProtocol, ...]:
@@ -82,7 +82,13 @@ class TrainingPlan:
         ]
 
     def chosen(self, grasps: Grasps) -> Grasps:
-        """Return the grasps of the tables on which the final model is trained."""
+        """Return the grasps of the tables on which the final model is trained.
+
+        Raises `ValueError` if one of these tables has no grasps.
+        """
+        for table in self.system.tables:
+            if not len(grasps.rows_of((table,))):
+                raise ValueError(f"there are no grasps of the table {table!r} to train on")
         return grasps.rows(grasps.rows_of(self.system.tables))
 
     @property

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import gzip
 import hashlib
+import io
 import json
 import re
 from pathlib import Path
@@ -18,6 +20,8 @@ from graspd.models.runtime import TactileModel
 from graspd.models.training.data.datasets import Grasps
 from graspd.models.training.making import make_model
 from graspd.models.training.making.export import ExportError
+from graspd.models.training.making.plan import TrainingPlan
+from graspd.models.training.systems.registry import SYSTEMS
 from tests.kit.inside import graspd
 from tests.kit.tables import write_table
 from tests.models.training.samples import (
@@ -128,6 +132,31 @@ def test_the_smallest_own_table_makes_a_model(tmp_path: Path) -> None:
     assert (card["data"]["repository"], card["data"]["cite"]) == (None, [])
     assert any("on another day" in point for point in card["weak_points"])
     assert "graspd train: warning: 20 grasps are few" in done.stderr
+
+
+def test_packed_and_piped_tables_are_trained_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write(tmp_path / "friday.csv", table("lab", 60, 0))
+    write(tmp_path / "monday.csv", table("lab", 40, 1))
+    packed = tmp_path / "friday.csv.gz"
+    packed.write_bytes(gzip.compress((tmp_path / "friday.csv").read_bytes()))
+    piped = io.TextIOWrapper(io.BytesIO((tmp_path / "monday.csv").read_bytes()))
+    monkeypatch.setattr("sys.stdin", piped)
+    monkeypatch.chdir(tmp_path)
+    done = train("--own", packed, "--own", "-", "--only", "cv", "--folds", "2", system="svm")
+    assert done.returncode == 0, done.stderr
+    path = Path("runs", "svm-friday-standard-input", "svm-friday-standard-input.json")
+    card = json.loads(path.read_text())
+    rows = [(file["name"], file["rows"]) for file in card["contract"]["datasets"]]
+    assert rows == [("friday", 60), ("standard input", 40)]
+    assert "--own friday.csv.gz --own - " in card["command"]
+
+
+def test_a_plans_table_without_grasps_is_refused() -> None:
+    system = dataclasses.replace(SYSTEMS["svm"], tables=("lab", "monday"))
+    with pytest.raises(ValueError, match="no grasps of the table 'monday'"):
+        TrainingPlan(system, folds=2, seed=0).chosen(smallest())
 
 
 def test_one_object_is_measured_by_cv_in_fewer_folds(tmp_path: Path) -> None:
