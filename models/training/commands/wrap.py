@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
     content: bytes = model.SerializeToString(deterministic=True)
     with replacing(path) as part:
         part.write_bytes(content)
-        trial.load(part)
+        _try(part, source)
     weak = ON_TABLE if measured.protocol == "table" else BY_OBJECTS
     card = {
         "what": f"made elsewhere, from {source.name}",
@@ -125,6 +125,14 @@ def _scores(model: onnx.ModelProto, grasps: Grasps, rows: NDArray[np.int64]) -> 
     return float(f1_score(slipped, slips)), float(accuracy_score(slipped, slips))
 
 
+def _try(part: Path, source: Path) -> None:
+    """Load the file `part` as the daemon does. Raises `ModelError`, which names the `source`."""
+    try:
+        trial.load(part)
+    except ModelError as error:
+        raise ModelError(str(error).replace(str(part), str(source))) from error
+
+
 def _error(protocol: str, scores: list[tuple[float, float]]) -> MeasuredError:
     f1, accuracy = np.array(scores).T
     means = float(f1.mean()), float(f1.std()), float(accuracy.mean()), float(accuracy.std())
@@ -143,19 +151,25 @@ def _with_ends(network: bytes, grasps: Grasps) -> onnx.ModelProto:
     fingers = len(grasps.fingers)
     session = _session(network)
     inputs, outputs = session.get_inputs(), session.get_outputs()
-    of_two = [each for each in outputs if each.type == "tensor(float)" and each.shape[-1:] == [2]]
+    of_two = [each for each in outputs if each.type == "tensor(float)" and each.shape[1:] == [2]]
     of_one = [each for each in outputs if each.type == "tensor(float)" and each.shape[1:] == [1]]
     shapes = ([fingers, ELECTRODES], [fingers * ELECTRODES])
     fits = len(inputs) == 1 and inputs[0].type == "tensor(float)" and inputs[0].shape[1:] in shapes
+    ends = [f"{each.name} {each.type} {each.shape}" for each in (*inputs, *outputs)]
+    refusal = (
+        f"the network must take float counts (n, {fingers}, 24) or (n, {24 * fingers}) and "
+        "return (n, 2), stable and slip, or (n, 1), log-odds of slip; it has "
+        f"{', '.join(ends)}"
+    )
     if not fits or not (of_two or of_one):
-        ends = [f"{each.name} {each.type} {each.shape}" for each in (*inputs, *outputs)]
-        raise ModelError(
-            f"the network must take float counts (n, {fingers}, 24) or (n, {24 * fingers}) and "
-            "return (n, 2), stable and slip, or (n, 1), log-odds of slip; it has "
-            f"{', '.join(ends)}"
-        )
+        raise ModelError(refusal)
     given, answer = inputs[0], (of_two or of_one)[0]
-    read = _answers(given.name, answer.name, grasps.counts, given.shape[1:], session)
+    try:
+        read = _answers(given.name, answer.name, grasps.counts, given.shape[1:], session)
+    except Exception as error:  # onnxruntime's exceptions share no narrower base
+        raise ModelError(f"{refusal}; of one grasp: {one_line(error)}") from error
+    if read.shape != (len(grasps), answer.shape[1]):
+        raise ModelError(f"{refusal}, and returned {read.shape} of {len(grasps)} grasps")
     model = compose.add_prefix(onnx.load_from_string(network), "made/")
     graph, width = model.graph, fingers * ELECTRODES
     shape = np.array([-1, *given.shape[1:]], np.int64)

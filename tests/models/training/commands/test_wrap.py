@@ -15,6 +15,8 @@ pytest.importorskip("torch", reason="needs the extra `train`")
 import torch
 
 import graspd
+from graspd.models import trial
+from graspd.models.contract import ModelError
 from graspd.models.runtime import TactileModel
 from tests.kit.inside import graspd as command
 from tests.kit.tables import write_table
@@ -64,9 +66,20 @@ def test_a_wrapped_network_judges_separable_grasps_rightly(
     assert set(graspd.load(out / "net.onnx").predict(np.full((1, 3, 24), 2000))) == {"unknown"}
 
 
-def wrapped(folder: Path, network: torch.nn.Module, shape: tuple[int, ...]) -> str:
+def wrapped(
+    folder: Path, network: torch.nn.Module, shape: tuple[int, ...], axes: tuple[int, ...] = (0,)
+) -> str:
+    """Return what is said of wrapping a network; `axes`: those of its input of any length."""
     path = folder / "other.onnx"
-    torch.onnx.export(network.eval(), (torch.ones(shape),), path, dynamo=False)
+    free = {"counts": {axis: f"n{axis}" for axis in axes}}
+    torch.onnx.export(
+        network.eval(),
+        (torch.ones(shape),),
+        path,
+        input_names=["counts"],
+        dynamic_axes=free,
+        dynamo=False,
+    )
     done = command("models", "wrap", path, "--data", folder / "own.csv", "--out", folder / "other")
     return done.stderr if done.returncode else done.stdout
 
@@ -81,7 +94,44 @@ def test_a_networks_single_output_is_read_as_slip_log_odds(folder: Path) -> None
     assert "F1 100.0 % on the table itself" in wrapped(folder, Ramp(), (1, 72))
 
 
-def test_a_network_of_another_shape_is_refused(folder: Path) -> None:
-    for inputs, outputs in ((48, 2), (72, 3)):
-        network = torch.nn.Linear(inputs, outputs)
-        assert "must take float counts" in wrapped(folder, network, (1, inputs))
+class Flat(torch.nn.Linear):
+    """Gives the answer to the first grasp alone, of shape (2,)."""
+
+    def forward(self, counts: torch.Tensor) -> torch.Tensor:
+        return super().forward(counts)[0]
+
+
+OTHERS: dict[str, tuple[torch.nn.Module, tuple[int, ...], tuple[int, ...]]] = {
+    "two fingers": (torch.nn.Linear(48, 2), (1, 48), (0,)),
+    "three classes": (torch.nn.Linear(72, 3), (1, 72), (0,)),
+    "an answer per finger": (torch.nn.Linear(24, 2), (1, 3, 24), (0,)),
+    "a batch of 32": (torch.nn.Linear(72, 2), (32, 72), ()),
+    "one answer without its axis": (Flat(72, 2), (1, 72), (0,)),
+    "probabilities of three axes": (
+        torch.nn.Sequential(
+            torch.nn.Linear(72, 2), torch.nn.Softmax(1), torch.nn.Unflatten(1, (1, 2))
+        ),
+        (1, 72),
+        (0,),
+    ),
+}
+
+
+@pytest.mark.parametrize("other", OTHERS.values(), ids=OTHERS)
+def test_a_network_of_another_shape_is_refused(
+    folder: Path, other: tuple[torch.nn.Module, tuple[int, ...], tuple[int, ...]]
+) -> None:
+    said = wrapped(folder, *other)
+    assert said.startswith("graspd: ")
+    assert "must take float counts (n, 3, 24)" in said
+
+
+def test_a_network_refused_by_the_trial_is_named_itself(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def too_slow(path: Path) -> None:
+        raise ModelError(f"{path}: takes too long")
+
+    monkeypatch.setattr(trial, "load", too_slow)
+    said = wrapped(folder, torch.nn.Linear(72, 2), (1, 72))
+    assert said == f"graspd: {folder / 'other.onnx'}: takes too long\n"
