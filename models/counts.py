@@ -83,6 +83,8 @@ def _cells(column: Any, what: str) -> list[Any]:  # noqa: ANN401
         values = values.astype(str)  # 28.35, not 28.350000381, which it is as a double
     elif values.dtype.kind in "mM":  # dates as text, because numbers would have a unit
         since = values - values.dtype.type(0, "us")
+        if since.dtype != np.dtype("m8[us]"):  # finer, which a cast would cut
+            since = since + np.timedelta64(500, "ns")
         values = np.datetime64(0, "us") + since.astype("timedelta64[us]")
     cells: list[Any] = values.tolist()
     return cells
