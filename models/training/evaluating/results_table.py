@@ -64,7 +64,7 @@ def results_table(
 def _head(*, quick: bool) -> Iterator[str]:
     yield "# Results"
     yield (
-        "This page is for those who compare models. Figures are F1 in %, slip positive, unless a "
+        "For those who compare models. Figures are F1 in %, slip positive, unless a "
         "column says otherwise. `+-` is the standard deviation over the folds (`unknown`: over the "
         "trainings), s.e. the standard error over the split seeds. A model's card (`graspd models "
         "NAME`) has the first seed alone."
