@@ -63,11 +63,12 @@ def fingers_of(names: Sequence[str]) -> tuple[Finger, ...]:
 def write_csv(table: Any, folder: str) -> Path:  # noqa: ANN401
     """Write `table.csv` in a folder, a missing value as an empty cell; return the file's path.
 
-    Raises `ValueError` for a column that occurs twice, is of float16, or differs in length.
+    NUL is left out of text; what UTF-8 does not have becomes `\\udcff`. Raises `ValueError` for a
+    column that occurs twice, is of float16, or differs in length.
     """
     names, path = column_names(table), Path(folder, "table.csv")
     columns = [_cells(column, what) for what, column in _columns(table, names, names).items()]
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with path.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file:
         rows = [names, *zip(*columns, strict=True)]
         csv.writer(file, quoting=csv.QUOTE_NONNUMERIC).writerows(rows)  # `#1` is not a comment
     return path
@@ -87,7 +88,7 @@ def _cells(column: Any, what: str) -> list[Any]:  # noqa: ANN401
             since = since + np.timedelta64(500, "ns")
         values = np.datetime64(0, "us") + since.astype("timedelta64[us]")
     cells: list[Any] = values.tolist()
-    return cells
+    return [cell.replace("\0", "") if isinstance(cell, str) else cell for cell in cells]
 
 
 def check_fingers(fingers: Sequence[str]) -> None:

@@ -114,6 +114,15 @@ def test_missing_or_too_coarse_times_are_refused(
         list(graspd.judge(stream.assign(t=times(stream.t.to_numpy()))))
 
 
+@pytest.mark.parametrize("text", ["a\udcff", "a\0b"])
+def test_text_that_no_csv_can_hold_does_not_hinder_judging(text: str) -> None:
+    pandas = pytest.importorskip("pandas", reason="needs the extra `pandas`")
+    stream = graspd.read_recording(DEMO_RECORDING)[:400]
+    noted = stream.assign(note=pandas.Series([text] * len(stream), dtype=object))
+    told = [[each.reasons for each in graspd.judge(given)] for given in (stream, noted)]
+    assert told[0] == told[1]
+
+
 def test_sweeps_without_times_are_refused_as_grasps() -> None:
     pytest.importorskip("pandas", reason="needs the extra `pandas`")
     sweeps = graspd.read_recording(DEMO_RECORDING)[:260].drop(columns="t")
