@@ -29,7 +29,8 @@ from graspd.models.contract import (
 )
 from graspd.models.inputs import builder
 from graspd.models.runtime import one_line, single_threaded
-from graspd.models.training.data.datasets import DatasetError, Grasps, concatenate, read_table
+from graspd.models.training.commands.common import read_each
+from graspd.models.training.data.datasets import DatasetError, Grasps, check_once, concatenate
 from graspd.models.training.data.protocols import FOLDS, object_folds
 from graspd.models.training.evaluating.files import replacing, to_json, write_whole
 from graspd.models.training.fitting.novelty import seen_counts
@@ -45,7 +46,10 @@ BY_OBJECTS = "Its worth on another day than those of its table was not measured.
 def run(args: argparse.Namespace) -> int:
     """Write NAME.onnx and its card. Raises `ModelError` and `DatasetError` for wrong input."""
     source = Path(args.what[1])
-    grasps = concatenate([read_table(path) for path in args.data])
+    grasps = concatenate(read_each(args.data, None))
+    check_once(
+        grasps, {file.name: path for file, path in zip(grasps.files, args.data, strict=True)}
+    )
     if grasps.slipped.all() or not grasps.slipped.any():
         raise DatasetError(args.data[0], "has one kind of grasps, a model needs both kinds")
     name = args.name or f"{source.stem}-wrapped"

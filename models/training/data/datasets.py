@@ -6,7 +6,7 @@ import dataclasses
 import hashlib
 import json
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -172,7 +172,7 @@ def read_with_lab_tables(
         paths[table_name(path)] = path
         parts.append(_read_lab_table(path, read_as))
     grasps = concatenate(parts)
-    _check_once(grasps, paths)
+    check_once(grasps, paths)
     return grasps
 
 
@@ -255,7 +255,7 @@ def first_readings(counts: NDArray[np.uint16]) -> Ints:
     return found
 
 
-def _check_once(grasps: Grasps, lab: dict[str, Path]) -> None:
+def check_once(grasps: Grasps, lab: Mapping[str, Path]) -> None:
     """Raise `DatasetError` if a lab table repeats a grasp, as training and test would share it.
 
     `lab`: path of each lab table by its name.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 import runpy
@@ -82,6 +83,20 @@ def wrapped(
     )
     done = command("models", "wrap", path, "--data", folder / "own.csv", "--out", folder / "other")
     return done.stderr if done.returncode else done.stdout
+
+
+def test_a_piped_table_is_wrapped_and_a_repeated_one_refused(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    table = folder / "own.csv"
+    piped = io.TextIOWrapper(io.BytesIO(table.read_bytes()))
+    monkeypatch.setattr("sys.stdin", piped)
+    words = "models", "wrap", folder / "net.onnx", "--name", "piped", "--out", folder / "piped"
+    done = command(*words, "--data", "-")
+    assert done.returncode == 0, done.stderr
+    done = command(*words, "--data", table, "--data", table)
+    assert done.returncode == 2
+    assert f"{table}: has counts twice: the same grasp counts once" in done.stderr
 
 
 def test_a_networks_single_output_is_read_as_slip_log_odds(folder: Path) -> None:
