@@ -56,8 +56,9 @@ class TrainingPlan:
         """Name of the model and of its files, such as small-session or small-session-monday."""
         if self.name is not None:
             return self.name
-        own = set(self.system.tables).difference(table.name for table in TABLES)
-        words = "-".join((self.system.name, *filter(own.__contains__, self.system.tables)))
+        published = {table.name for table in TABLES}
+        own = (name for name in self.system.tables if name not in published)
+        words = "-".join((self.system.name, *own))
         return re.sub(r"[^A-Za-z0-9._]+", "-", words)[:NAME_MAX].rstrip("-.")
 
     def protocols(self, grasps: Grasps) -> tuple[EvalProtocol, ...]:
