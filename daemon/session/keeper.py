@@ -195,8 +195,9 @@ class SessionKeeper(SensorWatch):
 
     def _has_other_sensors(self, used: KeptSession) -> bool:
         """Return True if a session of these fingers with other sensors than `used` is kept too."""
-        of_fingers = (each for each in self._others if each.fingers == self._fingers)
-        return not all(is_of_sensors(each, used) for each in of_fingers)
+        return any(
+            each.fingers == self._fingers and not is_of_sensors(each, used) for each in self._others
+        )
 
     def _with_serials(self, serials: Mapping[str, str]) -> KeptSession | None:
         now = numbers(serials).items()
