@@ -344,8 +344,10 @@ settle() {
         done
         set -- -f -s "$root" -p /
     fi
-    # A module that does not compile is one that is never used: pip does not mind either.
-    "$new/bin/python" -I -m compileall -qq -j 0 "$@" "$new/lib" || true
+    # What graspd never imports, a third, stays as it is. A module that does not compile is one
+    # that is never used: pip does not mind either.
+    unused='/site-packages/((pip|setuptools|pkg_resources)|.*/tests)/'
+    "$new/bin/python" -I -m compileall -qq -j 0 -x "$unused" "$@" "$new/lib" || true
 }
 
 # Former environments, except those that a running graspd still uses.
