@@ -54,7 +54,8 @@ NOT_OURS_ADVICE = {
     Cause.VERSION: "No known palm sends this length. Other firmware, or a relay that adds bytes.",
     Cause.MESSAGES: "They are of another form than deploy/wire/TACTILE.md or JOINTS.md.",
     Cause.FOREIGN_SENDER: "They are of another hand. Compare hand.name, or give each hand a port.",
-    Cause.REPEATED: "Their numbers or times do not rise: the same data comes again and again.",
+    Cause.REPEATED: "Their numbers or times do not rise: the same data comes again and again, or "
+    "the sender's clock was set back.",
     Cause.BITRATE: "Set the interface to the board's bit rate.",
     Cause.NOT_A_BRIDGE: f"Check the baud rate. If it is not a bridge yet: {FLASH}",
     Cause.PALM_MODE: "The palm is in a service mode or starting. Let the hand's driver start it.",
@@ -103,7 +104,8 @@ ADVICE = {
     Cause.DAMAGED: f"Bytes are damaged or foreign. {AGAIN} cable, hub, and who else sends there.",
     Cause.COMPUTER_BUSY: "This computer reads too late. See top; [realtime] puts graspd first.",
     Cause.CLOCK: f"The board's clock stands, was reset, or is wrong. {FLASH}",
-    Cause.REPEATED: "Data comes twice. Check for a second sender, and whether the board hangs.",
+    Cause.REPEATED: "Data comes twice, or its number or time fell. Check for a second sender, "
+    "whether the board hangs, and whether the sender restarted or its clock was set back.",
     Cause.FOREIGN_SENDER: "Two programs send to one port, and one is read. Name it with only_from.",
     Cause.SETTINGS: "The board samples channels that the scene's sequence lacks. Align them.",
     Cause.FRAMES_LOST: f"Data is lost or late. {AGAIN} the load of bus, hub and this computer.",
