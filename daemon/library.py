@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import threading
@@ -27,6 +28,7 @@ from graspd.daemon.run.unjudged import Unjudged
 from graspd.daemon.scene import SceneError
 from graspd.daemon.session import file as session_file
 from graspd.drivers.base import JointReading, RecordingError
+from graspd.drivers.recordings import csv_player
 from graspd.drivers.recordings.columns import (
     OBJECT,
     SLIPPED,
@@ -343,14 +345,25 @@ def _refuse_coarse(table: Any, time: str | None) -> None:  # noqa: ANN401
 
 @contextmanager
 def _named_as_given(path: Path) -> Iterator[None]:
-    """Raise `ValueError`, which names the given table, for an error that names the file `path`."""
+    """Let errors, as `ValueError`, and warnings that name the file `path` name the given table."""
+
+    def of_table(said: str) -> str:
+        said = said.replace(str(path), "the table").replace(", line 1:", ":")
+        return re.sub(r", line (\d+)", lambda found: f", row {int(found[1]) - 2} (from 0)", said)
+
+    def rename(record: logging.LogRecord) -> bool:
+        if str(path) in record.getMessage():
+            record.msg, record.args = of_table(record.getMessage()), None
+        return True
+
+    log = logging.getLogger(csv_player.__name__)
+    log.addFilter(rename)
     try:
         yield
     except (RecordingError, SceneError) as error:
-        said = str(error).replace(str(path), "the table")
-        said = said.replace(", line 1:", ":")
-        said = re.sub(r", line (\d+)", lambda found: f", row {int(found[1]) - 2} (from 0)", said)
-        raise ValueError(_in_arguments(said)) from None
+        raise ValueError(_in_arguments(of_table(str(error)))) from None
+    finally:
+        log.removeFilter(rename)
 
 
 def _in_arguments(said: str) -> str:

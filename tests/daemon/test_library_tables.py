@@ -183,3 +183,11 @@ def test_a_session_not_needed_or_not_found_is_refused(
         graspd.load("mlp").predict_proba(counts[:1], session=counts)
     with pytest.raises(SessionFileError, match="No such file"):
         graspd.load("small-session").predict_proba(counts[:1], session=tmp_path / "none")
+
+
+def test_a_warning_about_a_table_names_its_row(caplog: pytest.LogCaptureFixture) -> None:
+    pytest.importorskip("pandas", reason="needs the extra `pandas`")
+    stream = graspd.read_recording(DEMO_RECORDING)[:400]
+    list(graspd.judge(stream.assign(slipped="perhaps 100 %")))
+    [said] = [each for each in caplog.messages if "slipped" in each]
+    assert "known: the table, row 0 (from 0), column slipped: 'perhaps 100 %'" in said
