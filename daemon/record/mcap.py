@@ -119,7 +119,7 @@ class McapWriter(RecordingFile):
     """Writer of one MCAP file."""
 
     def __init__(self, path: Path, header: RecordingHeader) -> None:
-        """Create the file, and write `header`."""
+        """Create the file, which must not exist, and write `header`."""
         super().__init__(path)
         self._offset_ns = header.wall_minus_monotonic_ns
         self._last_ns = -1

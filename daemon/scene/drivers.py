@@ -139,7 +139,7 @@ class SpiTactile(DriverSection):
 
     @property
     def device(self) -> Device:
-        """Return the serial port."""
+        """Return the serial port, as a `Device`."""
         return Device(DeviceKind.SERIAL, self.port, "port")
 
 
@@ -167,7 +167,7 @@ class CanTactile(DriverSection):
 
     @property
     def device(self) -> Device:
-        """Return the bus; two drivers can share one if the ids of their frames differ."""
+        """Return the bus, as a `Device`; two drivers can share it if their frames' ids differ."""
         kind = BUS_KINDS.get(self.interface, DeviceKind.BUS)
         return Device(kind, self.channel, "channel and arbitration_id", str(self.arbitration_id))
 
@@ -182,7 +182,7 @@ class UdpSection(DriverSection):
 
     @property
     def device(self) -> Device:
-        """Return the address that the driver listens on."""
+        """Return the address that the driver listens on, as a `Device`."""
         return Device(DeviceKind.UDP, self.source, "source", only_from=self.only_from)
 
 

@@ -253,8 +253,8 @@ class SessionKeeper(SensorWatch):
     def _begin(self, former: KeptSession | None, *, tared: bool = False) -> None:
         """Keep the running session for later; continue `former`, the session of the new sensors.
 
-        None: begin an empty one. `tared`: the new sensors rest as in `former`, so their warm-up
-        counts again.
+        None: begin an empty one. `tared`: the present tare was made with the new sensors; it stays,
+        and their warm-up counts again.
         """
         leaving = self._now()
         if not leaving.is_empty:
@@ -265,7 +265,8 @@ class SessionKeeper(SensorWatch):
         self._save_due_ns = self._clock()
 
     def _take_up(self, former: KeptSession, *, tared: bool) -> bool:
-        """Continue the kept session of the new sensors; return False if it cannot be used."""
+        """Continue `former`, the session of the new sensors; return False if it cannot be used.
+        `tared`: as in `_begin`, True if the present tare was made with the new sensors."""
         trust = former.trust
         learned = None if trust is None else trust.learner
         proves = tared and not is_of_unknown_sensors(former)

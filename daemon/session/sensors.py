@@ -120,7 +120,7 @@ class SensorWatch(Companion):
 
     def _begin(self, _former: KeptSession | None, *, tared: bool = False) -> None:
         """Have the judge forget the former sensors. `SessionKeeper` continues the session `_former`
-        or begins an empty one (None). `tared`: the sensors rest as in `_former`."""
+        or begins an empty one (None). `tared`: the present tare was made with the new sensors."""
         self._sensors_exchanged()
         self._rest = None
 

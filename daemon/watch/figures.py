@@ -44,7 +44,8 @@ def doubt(verdict: Verdict) -> Line | None:
 
 
 def rests_on(verdict: Verdict) -> str:
-    """Return one line on the outcomes and the risk behind the verdict."""
+    """Return a line on the outcomes and the risk behind the verdict, or `NO_OUTCOME` without any;
+    before it, if known, the slip probability by the network alone."""
     network, risk = verdict.p_slip_model, verdict.risk
     said = "" if network is None else f"slip probability by the network alone {likely(network)}, "
     if risk is None or (risk.lifts == 0 and verdict.outcomes == 0):

@@ -46,14 +46,14 @@ def trust_once() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("name", zoo.names())
-def test_each_model_keeps_the_bounds_of_the_stability_report(name: str) -> None:
+def test_each_models_rounding_errors_keep_the_reports_bounds(name: str) -> None:
     rows = list(chain.rows(name))
     assert {row.case for row in rows} >= {*READINGS, "next to the threshold"}
     assert [row.case for row in rows if row.broken] == []
     assert all(sum(row.answers.values()) == row.figures["readings"] > 0 for row in rows)
 
 
-def test_the_default_model_keeps_the_bounds_on_real_grasps(bts3_dir: Path) -> None:
+def test_the_default_models_rounding_errors_on_real_grasps_keep_bounds(bts3_dir: Path) -> None:
     rows = list(chain.rows(DEFAULT, bts3_dir))[-3:]
     assert [row.figures["readings"] for row in rows] == [1276, 1273, 2133]  # as published
     assert [row.case for row in rows if row.broken] == []

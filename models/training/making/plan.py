@@ -62,8 +62,8 @@ class TrainingPlan:
         return re.sub(r"[^A-Za-z0-9._]+", "-", words)[:NAME_MAX].rstrip("-.")
 
     def protocols(self, grasps: Grasps) -> tuple[EvalProtocol, ...]:
-        """Return the protocols of the measurement: `cv`, then new objects, which calibrate the
-        probabilities; then, with all published tables, other days."""
+        """Return the protocols of the measurement: `only` if set; else `cv`, new objects, which
+        calibrate the probabilities, and, with all published tables, `session` and `days`."""
         if self.only is not None:
             return (self.only,)
         there = {file.name for file in grasps.files}

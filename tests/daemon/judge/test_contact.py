@@ -94,7 +94,7 @@ def held(*, for_ns: int, fall: float) -> Touch:
         (held(for_ns=60 * S + 1, fall=99.0), -99.0, False),
     ],
 )
-def test_a_finger_held_long_or_risen_is_tared_again(
+def test_a_finger_risen_or_released_after_long_is_tared_again(
     touch: Touch, middle: float, is_lost: bool
 ) -> None:
     assert touch.has_lost_rest(100 * S, middle) == is_lost
@@ -109,7 +109,7 @@ def sweeps_of(values: Iterable[float]) -> Sweeps:
 
 
 def wavering(step: float, number: int = 100) -> Sweeps:
-    """Return sweeps that alternate around 3000 by `step`: standard deviation 1.4826 times that."""
+    """Return sweeps that alternate around 3000 by `step`; `Rest.sigma` is 1.4826 times that."""
     return sweeps_of(3000 + step * (-1) ** sweep for sweep in range(number))
 
 

@@ -25,7 +25,7 @@ def rested(readings: int = 30) -> View:
 
 
 def images(view: View, *counts: list[int], faulty: tuple[int, ...] = ()) -> list[FingerImage]:
-    """Return the images of one more reading, `counts` of ff and th, while the hand closes."""
+    """Return the images of one more reading while the hand closes. Parameters: as in `tactile`."""
     view.take(b"verdict.right", verdict(98, gate=GateState.CLOSING), 0)
     view.take(b"tactile.right", tactile(99, *counts, faulty=faulty), 0)
     return view.snapshot(0).fingers
@@ -35,7 +35,8 @@ def images(view: View, *counts: list[int], faulty: tuple[int, ...] = ()) -> list
     ("fall", "level"), [(0, 0), (16, 10), (400, 50), (1600, 100), (3000, 100), (-400, -50)]
 )
 def test_a_pixels_level_is_the_root_of_the_electrodes_fall(fall: int, level: int) -> None:
-    """Root of the share of 1600 counts, in %: 16 / 1600 = 0.1 squared."""
+    """Root of the share of 1600 counts, in %: 16 / 1600 = 0.1 squared. At most 100; below 0 for
+    a rise."""
     first, second = images(rested(), [3000 - fall] * 24, RESTING)
     assert (first.name, first.from_rest, first.deepest) == ("ff", True, fall)
     assert first.levels == [level] * 132

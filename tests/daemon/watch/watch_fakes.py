@@ -63,7 +63,8 @@ def verdict(seq: int, decision: Decision = Decision.UNKNOWN, **other: Any) -> by
 
 
 def tactile(seq: int, *counts: list[int], faulty: tuple[int, ...] = ()) -> bytes:
-    """Return a message with `counts` of `ff` and `th`; `faulty`: electrodes of `ff`, from 0."""
+    """Return a message. `counts`: the 24 of `ff`, then the 24 of `th`. `faulty`: electrodes of
+    `ff`, from 0, which get a fault."""
     faults = [[0] * 24 for _ in counts]
     for electrode in faulty:
         faults[0][electrode] = 1

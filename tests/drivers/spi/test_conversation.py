@@ -195,7 +195,7 @@ def test_the_link_description_shows_board_and_sensors() -> None:
     assert words_of(conversation) == {"port": "port", **about, **lost}
 
 
-def test_the_link_description_shows_the_bridges_clock() -> None:
+def test_the_link_description_shows_clock_rate_sweep_time_and_errors() -> None:
     conversation = greeted(hello(0, period_ms=500))
     said(conversation, T0 + S)  # a PING, answered after 1 ms by a clock that is 100 ppm fast
     hear(conversation, hello(43, 1_000_100, period_ms=500), T0 + S + MS)

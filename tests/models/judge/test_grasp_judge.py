@@ -131,8 +131,8 @@ def test_a_finger_that_reads_about_the_same_everywhere_is_flat(
 
 
 @pytest.mark.parametrize(("swing", "flat"), [(0, True), (2, False)])
-def test_a_finger_whose_electrodes_all_agree_is_not_judged(swing: int, flat: bool) -> None:
-    """Its electrodes differ by less than a count (standard deviation)."""
+def test_a_grasp_with_a_finger_without_spread_is_not_judged(swing: int, flat: bool) -> None:
+    """`swing`: standard deviation of the finger, counts. `flat`: True if the grasp is refused."""
     counts, model = COUNTS.copy(), FakeModel(0.2)
     counts[1] = 2000 + swing * (-1) ** np.arange(24)
     opinion = judge_of(model).judge(Examined(counts))
