@@ -49,8 +49,6 @@ class Cells:
         """False after a last line without a line end."""
         self.decimal_comma = False
         """True if numbers may have a decimal comma."""
-        self._length = 0
-        """Number of characters read so far of the current row."""
         kind = kind_of_open(path, file)
         if kind not in TABLES:
             raise RecordingError(path, f"is {kind.value}, not a table or stream")
@@ -85,6 +83,7 @@ class Cells:
         separator, header, below = self._header(lines)
         self.decimal_comma = separator != ","
         self._length = 0
+        """Number of characters read so far of the current row."""
         rows = csv.reader(
             chain(header, self._row_lines(below, separator, header[-1].count(separator))),
             delimiter=separator,

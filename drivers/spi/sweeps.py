@@ -194,7 +194,8 @@ class DeviceClock:
         self._earliest, self._latest = _Bound(tick, sent_ns), _Bound(tick, received_ns)
         self._sent = deque([self._earliest], PINGS)
         self._last_tick, self._last_ns = tick, sent_ns
-        self._doubt_ns = 0
+        self.is_doubted = False
+        """True if a PING or a reading contradicted the bounds, and no PING has agreed since."""
 
     def round_trip(self, tick: int, sent_ns: int, received_ns: int) -> None:
         """Add an answered PING: its tick, and host times, ns, before sending it and after the
@@ -202,30 +203,24 @@ class DeviceClock:
         self.round_trip_ns = min(self.round_trip_ns, received_ns - sent_ns)
         earliest_ns = self._earliest_ns(self._earliest, tick)
         latest_ns = self._latest_ns(tick)
-        contradicts = earliest_ns > received_ns or latest_ns < sent_ns
-        self._doubt_ns = DOUBT_NS if contradicts else 0
-        if contradicts:
+        self.is_doubted = earliest_ns > received_ns or latest_ns < sent_ns
+        if self.is_doubted:
             self._sent.clear()
             self._last_ns = 0  # it came from a wrong bound
         self._sent.append(_Bound(tick, sent_ns))
         self._earliest = max(self._sent, key=lambda bound: self._earliest_ns(bound, tick))
-        if contradicts or latest_ns - self._ns_per_tick >= received_ns:
+        if self.is_doubted or latest_ns - self._ns_per_tick >= received_ns:
             self._latest = _Bound(tick, received_ns)
-
-    @property
-    def is_doubted(self) -> bool:
-        """True if a PING or a reading contradicted the bounds, and no PING has agreed since."""
-        return self._doubt_ns > 0
 
     def host_ns(self, tick: int, arrival_ns: int) -> int:
         """Return the host time, ns, of a reading's `tick`. Raises `ClockError`."""
         if tick <= self._last_tick:
             raise ClockError("stands or falls back")
-        earliest_ns = self._earliest_ns(self._earliest, tick) - self._doubt_ns
+        earliest_ns = self._earliest_ns(self._earliest, tick) - DOUBT_NS * self.is_doubted
         if earliest_ns > arrival_ns:
             if earliest_ns > arrival_ns + DOUBT_NS:
                 raise ClockError("jumps ahead")
-            self._doubt_ns = DOUBT_NS
+            self.is_doubted = True
             self._last_ns = 0
             earliest_ns = arrival_ns - DOUBT_NS
         self._last_tick = tick

@@ -96,8 +96,9 @@ def test_error_frames_say_what_happened() -> None:
     assert is_overflow(overflow)
     assert not is_overflow(passive)
     assert not is_overflow(CanFrame(0x004, b"\0", ERROR))
-    assert is_overflow(CanFrame(0x004, b"\0\1", ERROR))
-    assert not is_overflow(CanFrame(0x080, b"\0\1", ERROR))
+    for bit in range(10):
+        error = CanFrame(1 << bit, b"\0\1", ERROR)
+        assert (is_overflow(error), is_bus_off(error)) == (bit == 2, bit == 6)
     assert not is_overflow(CanFrame(0x004, b"\0\1"))
     assert describe_error(bus_off) == "bus-off"
     assert describe_error(passive) == "controller problem, error counters"

@@ -97,6 +97,8 @@ def test_a_raw_value_over_12_bits_gives_no_angle(raw: tuple[int, int]) -> None:
     assert math.isnan(degrees(load_calibration(EXAMPLE), THJ5=raw)["THJ5"])
     both = calibration(FFJ1=FFJ1, FFJ2=FFJ1)
     assert math.isnan(degrees(both, FFJ1=4096, FFJ2=2000)["FFJ0"])
+    angles = degrees(parse_calibration(coupled(COUPLED), FILE), THJ1=raw[0], THJ2=raw[1])
+    assert np.isnan([angles["THJ1"], angles["THJ2"]]).all()
 
 
 # Shadow's documentation, md_ranges.rst; J0 is the sum of J1 and J2.

@@ -117,12 +117,20 @@ def test_a_ros_2_bags_storage_file_is_read_alone(tmp_path: Path, plugin: Storage
     assert len(readings_of(storage.rename(tmp_path / "hand.bin"))) == 30
 
 
-def test_a_sensor_that_starts_late_is_read(tmp_path: Path) -> None:
-    sweeps = noise(30)
-    sweeps[0].electrodes["th"] = ABSENT
+@pytest.mark.parametrize(
+    ("rails", "absent", "is_there"),
+    [(24, range(9), True), (12, range(10, 20), False), (11, range(30), True)],
+)
+def test_a_finger_with_counts_in_most_early_messages_has_a_sensor(
+    tmp_path: Path, rails: int, absent: range, is_there: bool
+) -> None:
+    """Of the first 20 messages, in those of `absent` it has `rails` electrodes at a rail."""
+    sweeps, counts = noise(30), np.array([0, 4095] * 12 + [1, 4094] * 12, dtype=np.int16)
+    for place in absent:
+        sweeps[place].electrodes["th"] = counts[24 - rails : 48 - rails]
     path = BagOf(1).write(tmp_path / "hand.bag", sweeps)
-    assert fingers_of(path) == FINGERS
-    assert played(path)[0].period_ns == PERIOD_NS
+    assert fingers_of(path) == (FINGERS if is_there else ("ff", "mf"))
+    assert played(path, fingers=("ff",))[0].period_ns == PERIOD_NS
 
 
 @pytest.mark.parametrize(
@@ -183,6 +191,10 @@ def test_a_bag_whose_stamps_stand_still_logs_a_warning(
     path = BagOf(1).write(tmp_path / "hand.bag", [each._replace(t_ns=10**18) for each in noise(30)])
     assert len(readings_of(path)) == 1
     assert "header of 29 of 30 messages has no newer stamp" in caplog.text
+    caplog.clear()
+    half = held(noise(4), same_stamp=True)[2:]
+    assert len(readings_of(BagOf(1).write(tmp_path / "half.bag", half))) == 1
+    assert "no newer stamp" not in caplog.text
 
 
 def held(sweeps: list[Sweep], *, same_stamp: bool) -> list[Sweep]:

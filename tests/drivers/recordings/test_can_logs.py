@@ -69,6 +69,8 @@ def test_logs_written_by_python_can_give_the_sent_sweeps(
     assert log.stream.counters.frames == 9 * 24
     assert log.period_ns == pytest.approx(24 * STEP_NS, abs=1000)
     assert "understood" not in caplog.text
+    assert ("has no channel 0; played is can0" in caplog.text) == (ending == "log")
+    assert ("has no channel" in caplog.text) == (ending == "log")
 
 
 @pytest.mark.parametrize("ending", ["asc", "blf", "trc"])
@@ -107,10 +109,11 @@ def test_a_damaged_blf_file_plays_up_to_the_damage(
     else:
         content[second + 8 : second + 12] = b"\xff\xff\xff\x7f"
     path.write_bytes(content)
-    readings, _ = played([path])
+    readings, log = played([path])
     assert 2 <= len(readings) < 20
-    assert "1 of " in caplog.text
-    assert "damaged" in caplog.text
+    last = log.stream.counters.frames + 1
+    said = f"1 of {last} lines were not understood; the first is line {last}, 'damaged"
+    assert said in caplog.text
 
 
 def test_the_channel_of_a_scene_chooses_the_bus(
@@ -223,6 +226,16 @@ def test_times_since_the_last_frame_are_recognised(
     path.write_text(written(steps_ns if is_step else times_ns))
     readings, _ = played([path])
     assert [reading.made_ns for reading in readings] == times_ns[23::24]
+
+
+@pytest.mark.parametrize(("falls", "is_step"), [(3, False), (4, True)])
+def test_times_with_four_falls_in_ten_rises_are_steps(
+    tmp_path: Path, falls: int, is_step: bool
+) -> None:
+    times = [0, *[1, 0] * falls, *range(1, 11 - falls)]
+    path = tmp_path / "shown.txt"
+    path.write_text("".join(f" (000.00000{t})  can0  5A1   [1]  0D\n" for t in times))
+    assert Survey.of(path).has_steps == is_step
 
 
 def test_a_log_clock_set_back_plays_as_a_pause(tmp_path: Path) -> None:

@@ -68,7 +68,7 @@ DIALECTS = {
     "spaces": PLAIN.replace(b",", b" "),
     "sep line": b"sep=;\r\n" + PLAIN.replace(b",", b";"),
     "sep line of another": b"sep=:\r\n" + PLAIN.replace(b",", b":"),
-    "a comment within": text(lambda it: it.replace("thing_2", "# later\nthing_2")),
+    "a comment within": text(lambda it: it.replace("thing", "# later\nthing")),
     "a header in a comment": b"# lab A\n# " + PLAIN,
     "carriage returns": PLAIN.replace(b"\n", b"\r"),
     "labels in capitals": PLAIN.replace(b"slipped", b"Slipped").replace(b"object", b"OBJECT"),

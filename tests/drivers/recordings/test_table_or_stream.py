@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from graspd.drivers.base import RecordingError
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
 from graspd.drivers.recordings.csv_rows import read_rows
-from graspd.drivers.recordings.layout import ReadAs, are_labelled, layout_of
+from graspd.drivers.recordings.layout import ReadAs, are_labelled, layout_of, problem_of_sweeps
 from tests.drivers.recordings.tables import (
     FINGERS,
     stream,
@@ -42,6 +42,14 @@ def test_the_unit_of_times_is_known_by_their_steps(tmp_path: Path, unit_s: float
     cells[:, place] = [f"{float(value) / unit_s:.0f}" for value in cells[:, place]]
     found = layout_of(write(tmp_path, written(names, cells)), FINGERS)
     assert (found.is_stream, found.unit_s, found.has_outcomes) == (True, unit_s, True)
+
+
+@pytest.mark.parametrize(("step", "unit_s"), [(1.9, 1.0), (2, 1e-3), (500, 1e-3), (501, 1.0)])
+def test_times_2_to_500_ms_apart_may_be_milliseconds(
+    tmp_path: Path, step: float, unit_s: float
+) -> None:
+    path = write(tmp_path, stream([f"{step * row}" for row in range(4)]))
+    assert layout_of(path, FINGERS, "stream").unit_s == unit_s
 
 
 @pytest.mark.parametrize(
@@ -150,6 +158,33 @@ def test_repeated_readings_of_grasps_need_read_as_table(tmp_path: Path) -> None:
 )
 def test_rows_are_labelled_if_lifts_ended_in_both_ways(cells: Sequence[str], both: bool) -> None:
     assert are_labelled(("mug", cell) for cell in cells) == both
+
+
+@pytest.mark.parametrize(
+    ("near", "between", "far", "labelled", "read_as", "said"),
+    [
+        (4, 0, 16, True, None, None),
+        (5, 0, 15, True, None, "5 of 20 rows nearly repeat another: sweeps of"),
+        (4, 9, 7, True, None, None),
+        (4, 10, 6, True, None, "most of 20 rows are much like another: sweeps of"),
+        (3, 0, 17, False, None, "3 of 20 rows nearly"),
+        (2, 8, 10, False, None, None),
+        (2, 9, 9, False, None, "most of 20 rows"),
+        *((18, 2, 0, False, "table", None), (17, 3, 0, False, "table", "change as sweeps")),
+        *((14, 3, 2, False, "table", None), (13, 4, 2, False, "table", "change as sweeps")),
+        *((49, 0, 1, False, "table", None), (50, 0, 1, False, "table", "change as sweeps")),
+        *((9, 0, 0, False, "table", None), (10, 0, 0, False, "table", "change as sweeps")),
+    ],
+)
+def test_rows_alike_beyond_each_limit_are_sweeps(
+    near: int, between: int, far: int, labelled: bool, read_as: ReadAs | None, said: str | None
+) -> None:
+    """Rows up to 8 counts from another are near, up to 25 between, others far. By hand: 0.6 of all
+    beyond 8 counts is 3 of 5, and 3.6 of 6."""
+    steps = [26, *[8] * (near - 1), *[26, 9, *[25] * between][:between]]
+    rows = np.cumsum(steps + [26] * far)[:, np.newaxis].repeat(24, axis=1).astype(np.float32)
+    problem = problem_of_sweeps([rows], read_as, labelled=labelled)
+    assert (problem is None) if said is None else said in (problem or "")
 
 
 def test_few_repeated_grasps_need_labels_or_read_as_table(tmp_path: Path) -> None:

@@ -47,6 +47,7 @@ def test_a_port_name_that_cannot_exist_is_refused(port: str) -> None:
 def test_opening_sends_stop_and_ping_then_start_when_answered(rig: Rig) -> None:
     said = rig.greet()
     assert [type(message) for message in said] == [Stop, Ping]
+    assert said[1] == Ping((rig.clock.now_ns + 1) % 2**32), "another in each start"
     assert [type(message) for message in rig.bridge.heard(Start)] == [Start]
     assert str(rig.driver.conversation.link.state) == "greeting"
     assert rig.driver.period_ns == 10 * MS
