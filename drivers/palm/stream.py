@@ -331,7 +331,7 @@ class PalmDriver(DatagramDriver[PalmStream]):
         self._calibration: Path | None = None  # `open` reads it
         super().__init__(source, only_from=only_from, clock=clock)
         self._calibration = calibration
-        self._attention_ns = 0
+        self._attention_ns = clock()
 
     def _new_stream(self) -> PalmStream:
         return PalmStream(

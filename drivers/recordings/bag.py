@@ -202,7 +202,7 @@ class _Bag:
         found.sort(key=lambda each: (not each.topic.startswith("/rh/"), len(each.topic)))
         if kind == JOINTS:
             found.sort(key=lambda each: each.topic != "/joint_states")
-        for other in found[1:]:
+        for other in found:
             if other.topic != found[0].topic:
                 _log.warning("%s: %s is left out", self._path, other.topic)
         return found[0] if found else None

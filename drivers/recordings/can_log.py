@@ -173,8 +173,11 @@ class CanLog(LinkLogDriver[CanFrame]):
         self._channel = None if channel is None else bus_name(channel)
         self._bus: str | None = None
         self._surveys: dict[Path, Survey] = {}
-        self._shift_ns = self._last_ns = 0
         self.begin()
+
+    def begin(self) -> None:
+        self._shift_ns = self._last_ns = 0
+        self.stream = CanStream("link log", self._fingers, **self._board)
 
     def open(self) -> None:
         """Read the first lines of the logs to choose the bus, then start."""
@@ -262,10 +265,6 @@ class CanLog(LinkLogDriver[CanFrame]):
             t_ns = self._last_ns + SET_BACK_NS
         self._last_ns = t_ns
         return t_ns
-
-    def begin(self) -> None:
-        self._shift_ns = self._last_ns = 0
-        self.stream = CanStream("link log", self._fingers, **self._board)
 
     def feed(self, t_ns: int, record: CanFrame) -> Sequence[Reading]:
         if self.stream.link.state is LinkState.CLOSED:

@@ -72,7 +72,6 @@ class SpiBridgeDriver(Opened):
         except ValueError as error:
             raise ValueError(f"port {port}: {error}") from error
         self._line = SerialLine(port, baud)
-        self._poll_due_ns = 0
         self.conversation = self._begin()
 
     def _begin(self) -> Conversation:

@@ -315,6 +315,9 @@ def test_the_driver_rests_until_two_cycles_before_a_rounds_end(
     clock.now_ns += 11 * MS
     assert driver.fileno() is not None
     assert driver.due_ns() == clock.now_ns + (10 * ROUND - 11) * MS
+    clock.now_ns += (10 * ROUND - 12) * MS
+    driver.read_ready()
+    assert driver.due_ns() == clock.now_ns + MS, "it also wakes to notice silence"
 
 
 def test_joint_readings_are_calibrated_and_come_every_10_ms(
@@ -336,6 +339,13 @@ def test_joint_readings_are_calibrated_and_come_every_10_ms(
     expected_deg = 45 + 22.5 * (1942 - 1303) / (1942 - 1247)
     assert np.degrees(angles["FFJ1"]) == pytest.approx(expected_deg, abs=0.05)
     assert np.isnan(angles["MFJ1"])
+
+
+def test_raw_values_over_12_bits_are_counted_as_bad_angles() -> None:
+    stream, packet = PalmStream(FINGERS, calibration=EXAMPLE), packets(1)[0]
+    bad = dataclasses.replace(packet, sensors=(4096,) * len(packet.sensors))
+    stream.receive(bad.to_bytes(), 0)
+    assert stream.counters.bad_angles == 5, "those of all joints in the file"
 
 
 def test_a_wrong_calibration_keeps_the_driver_from_opening(tmp_path: Path) -> None:

@@ -220,7 +220,9 @@ def test_values_not_counts_are_flagged_and_absent_sensors_refused(tmp_path: Path
     sweeps = noise(30)
     sweeps[25].electrodes["ff"][:5] = -1, 4096, 5000, 0, 4095  # a count has 12 bits
     path = BagOf(1).write(tmp_path / "hand.bag", sweeps)
-    reading = readings_of(path)[25]
+    driver, readings = played(path)
+    assert driver.counters.faulty_readings == 1
+    reading = readings[25]
     assert reading.counts[0, :5].tolist() == [0, 0, 0, 0, 4095]
     assert np.argwhere(reading.faults).tolist() == [[0, 0], [0, 1], [0, 2]]
     with pytest.raises(RecordingError, match="no sensor on rf, only on ff, mf, th"):
@@ -331,6 +333,7 @@ def test_joints_are_read_from_joint_states_among_several_topics(tmp_path: Path) 
         sweep = bag.tactile(noise(1)[0])
         writer.write(where, START_NS, bag.store.serialize_ros1(sweep, TACTILE))
     assert read_recording(path)["FFJ3"].tolist() == [0.5]
+    assert has_joints(path)
 
 
 def test_bags_of_different_hands_are_refused_as_one_run(tmp_path: Path) -> None:
