@@ -102,41 +102,38 @@ class StepRing:
 
     def __init__(self, shape: tuple[int, int]) -> None:
         """`shape` is (fingers, 24)."""
-        self.times_ns: list[int] = []
-        """Times of the steps that are kept, ns, oldest first."""
         self.times_s = np.zeros(2 * STEPS)
         """Times of `steps` since the first sweep, s."""
         self.steps = np.zeros((2 * STEPS, *shape), dtype=np.float32)
         """Buffer of steps. The kept ones are a slice from `first`; it moves right, then to 0."""
-        self.first = 0
-        """Index of the oldest entry in `steps`."""
         self.usable_since_ns = np.zeros(shape, dtype=np.int64)
         """Time since which each electrode is usable, ns, apart from gaps of `LOST_MAX` sweeps."""
-        self.sweeps = 0
-        """Number of sweeps in the unfinished step."""
         self.crowded = False
         """True if the step has over `STEP_SWEEPS_MAX` sweeps, which came late and all at once."""
-        self.last_ns: int | None = None
-        """Time of the last sweep that ended a step. None: there is none."""
-        self._all_usable_since_ns = 0
         self._lost = np.zeros(shape, dtype=np.uint8)
         """Number of sweeps for which each electrode was not usable, at most `LOST_MAX` + 1."""
         self._total = np.zeros(shape, dtype=np.float32)
         """Sum of the sweeps in the unfinished step."""
-        self._total_ns = 0
-        """Sum of these sweeps' times, counted from the end of the last step, ns."""
-        self._begun_ns = 0
-        """Time of the first sweep."""
+        self.reset()
 
     def reset(self) -> None:
         """Forget the steps."""
-        self.first = self.sweeps = self._total_ns = 0
-        self.times_ns.clear()
-        self.last_ns = None
+        self.times_ns: list[int] = []
+        """Times of the steps that are kept, ns, oldest first."""
+        self.first = 0
+        """Index of the oldest entry in `steps`."""
+        self.sweeps = 0
+        """Number of sweeps in the unfinished step."""
+        self._total_ns = 0
+        """Sum of these sweeps' times, counted from the end of the last step, ns."""
+        self.last_ns: int | None = None
+        """Time of the last sweep that ended a step. None: there is none."""
 
     def begin(self, t_ns: int) -> None:
         """Start with the first sweep, of `t_ns`, as the end of a step."""
-        self.last_ns = self._all_usable_since_ns = self._begun_ns = t_ns
+        self.last_ns = self._all_usable_since_ns = t_ns
+        self._begun_ns = t_ns
+        """Time of the first sweep."""
         self._lost.fill(LOST_MAX)
         self.usable_since_ns.fill(t_ns)
 
@@ -212,26 +209,25 @@ class NoiseBlocks:
     def __init__(self, fingers: int) -> None:
         self.sums = np.zeros((APART, fingers))
         """Sums of squared differences of steps 1 to `APART` apart, in the unfinished block."""
-        self.number = 0
-        """Number of finished blocks."""
         self._blocks = np.zeros((BLOCKS, APART, fingers))
         """Ring buffer of the blocks' mean squared differences, counts**2."""
+        self.reset()
+        self.forget()
+
+    def reset(self) -> None:
+        """Forget the unfinished block."""
         self._steps = 0
         """Number of steps in the unfinished block."""
         self._pending = 0
         """Number of these steps, the last ones, that are not in `sums` yet."""
-        self._noise: Noise | None = None
-        """Cached result of `noise`. None: a block was added since."""
-
-    def reset(self) -> None:
-        """Forget the unfinished block."""
-        self._steps = self._pending = 0
         self.sums.fill(0.0)
 
     def forget(self) -> None:
         """Forget all blocks."""
         self.number = 0
-        self._noise = None
+        """Number of finished blocks."""
+        self._noise: Noise | None = None
+        """Cached result of `noise`. None: a block was added since."""
 
     def learn(self, ring: StepRing) -> None:
         """Take in the last step of `ring`, which has just ended."""

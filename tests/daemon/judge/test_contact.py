@@ -146,7 +146,7 @@ def rested(fingers: int = 1) -> tuple[Contact, Counts]:
 def test_a_tare_comes_after_100_untouched_sweeps_then_every_25() -> None:
     contact, looks = Contact(1), []
     for place in range(1, 320):
-        counts = pressed(REST, 10 if place == 160 else 0)  # half of a touch
+        counts = pressed(REST, {120: 9, 160: 10}.get(place, 0))  # 10 is half of a touch
         contact.observe(place * PERIOD_NS, counts, counts, None)
         if contact.touches[0].tared_ns == place * PERIOD_NS:
             looks.append(place)
@@ -162,6 +162,16 @@ def test_a_finger_touching_alone_for_30_s_is_tared_again() -> None:
         assert contact.tared == [True, True]
     contact.observe(51 * S + 1, one, one, None)
     assert contact.tared == [False, True], "half a minute since it was left alone"
+
+
+@pytest.mark.parametrize(("by", "touches"), [(20, True), (19, False)])
+def test_the_depth_of_a_hold_fades_in_seconds(by: int, touches: bool) -> None:
+    """By 5 counts/s: 100 counts are 80 after 4 s, of which a quarter holds."""
+    contact, rest = rested()
+    for at_s, fall in ((1, 100), (5, 60), (5, by)):
+        counts = pressed(rest, fall)
+        contact.observe(at_s * S, counts, counts, None)
+    assert contact.touching == [touches]
 
 
 def test_two_fallen_electrodes_are_not_a_touch_and_three_are() -> None:

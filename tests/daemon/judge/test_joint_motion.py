@@ -270,8 +270,8 @@ def test_the_health_says_that_joints_are_frozen_until_one_changes() -> None:
     hand = HandLimits(joints=True)
     model = TactileModel(zoo.find("cnn1"))
     pipeline = Pipeline(model, FINGERS, Limits(), lambda: START_NS, hand=hand)
-    for ms in range(0, 1501, 10):
-        angles = np.array([0.8, 0.4 + (ms == 1500)])
+    for ms in range(0, 2601, 10):
+        angles = np.array([0.8, 0.4 + (ms >= 1500)])
         pipeline.observe_joints(JointReading(START_NS + ms * MS, 0, ("FFJ3", "THJ1"), angles))
         frozen = pipeline.health().get("joints") is Reason.JOINTS_FROZEN
-        assert frozen is (1000 < ms < 1500)
+        assert frozen is (1000 < ms < 1500 or ms > 2500)

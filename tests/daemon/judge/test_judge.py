@@ -169,6 +169,18 @@ def test_until_the_warm_up_ends_grasps_are_unproven_and_supervised() -> None:
         assert judgement.risk.warm_up_left == left
     assert found[3].reasons in ((), (Reason.LOW_CONFIDENCE,))
     assert not found[3].supervised
+    judge.sensors_exchanged()
+    risk = judge.judge(reading(clock(), 9)).risk
+    assert risk is not None
+    assert risk.warm_up_left == 3
+
+
+def test_outcomes_are_noted_without_learning_too() -> None:
+    clock = Clock()
+    judge = pipeline(FakeModel(), clock)
+    grasp = GraspId("", judge.judge(reading(clock())).moment.grasp)
+    told = [judge.outcome(grasp, slipped=slipped) for slipped in (True, True, False)]
+    assert told == ["taken", "repeated", "contradicts"]
 
 
 def test_unusable_or_stale_readings_ask_for_no_supervised_lift() -> None:

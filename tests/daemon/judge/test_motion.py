@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from graspd.daemon.judge.motion_limits import MotionLimits, Tails
 from graspd.daemon.judge.stillness import Motion, StepRing
-from graspd.daemon.judge.windows import LOST_MAX, STEPS, Noise
+from graspd.daemon.judge.windows import LOST_MAX, SLOPE_ECHO, SPREAD_ECHO, STEPS, Noise
 
 FINGER = np.ones((1, 24), dtype=np.bool_)
 SIGMA_COUNTS, CORRELATION = 3.5, 0.32
@@ -61,6 +61,7 @@ def test_motion_is_unknown_until_noise_is_known_and_after_gaps() -> None:
     motion.reset()
     assert not motion.strict.early
     assert not motion.strict.sure
+    assert motion.strict.fast == motion.loose.slow == [1.0]
     fast = []
     for index in range(30):
         motion.add(10**10 + index * 10_000_000, np.rint(counts[index]).astype(np.uint16), FINGER)
@@ -71,6 +72,13 @@ def test_motion_is_unknown_until_noise_is_known_and_after_gaps() -> None:
     motion.forget()
     fed(motion, counts[:90], 100.0, 2 * 10**10)
     assert not np.isfinite(moves(motion)).any()
+
+
+def test_the_echo_of_noise_in_windows_is_that_of_a_ramp() -> None:
+    """Closed forms of the sums, for neighbours in a window of n steps."""
+    n = np.arange(3, STEPS + 1)
+    np.testing.assert_allclose(SLOPE_ECHO[3:, 0], 1.0 - 3.0 / n, atol=1e-12)
+    np.testing.assert_allclose(SPREAD_ECHO[3:, 0], 2.0 / n)
 
 
 def test_a_jump_that_lasts_is_believed_in_its_fourth_sweep() -> None:
