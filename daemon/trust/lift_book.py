@@ -236,8 +236,8 @@ class LiftBook:
 
         Return False, and change nothing, if its outcome is known or the grasp is not in the book.
         """
-        awaited = (lift.id for lift in reversed(self._lifts.values()) if lift.is_awaited)
-        lift = self._lifts.get(grasp or next(awaited, GraspId("", 0)))
+        awaited = (lift for lift in reversed(self._lifts.values()) if lift.is_awaited)
+        lift = next(awaited, None) if grasp is None else self._lifts.get(grasp)
         if lift is None or lift.slipped is not None:
             return False
         self._lifts[lift.id] = replace(lift, announced=False, owner=None)

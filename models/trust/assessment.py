@@ -34,7 +34,7 @@ def assess(
     inputs: NDArray[np.floating],
     *,
     name: tuple[str, int],
-    awaited: int = 0,
+    awaited: int,
 ) -> Assessment:
     """Assess a grasp by the model's `p_slip`, its log-odds `margin`, and its flat `inputs`.
 

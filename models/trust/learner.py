@@ -184,8 +184,8 @@ def of_format_2(state: LearnerState) -> LearnerState:
     """Convert a state of format 2, whose mean and covariance are those that `Learner.at_told`
     returns. Raises `ValueError`."""
     mean, grasps = (np.frombuffer(each, "<f8") for each in (state.mean, state.grasps))
-    size, count = len(mean), min(state.outcomes, GRASPS_MAX) if state.grasps else 0
-    residual = Residual(grasps.reshape(count, -1) if count else np.empty((0, size - 2)))
+    size, count = len(mean), min(state.outcomes, GRASPS_MAX)
+    residual = Residual(grasps.reshape(count, -1) if state.grasps else np.empty((0, size - 2)))
     covariance = np.frombuffer(state.covariance, "<f8").reshape(size, size)
     mean, spread = residual.from_others(mean, covariance)
     return LearnerState(state.outcomes, mean.tobytes(), spread.tobytes(), state.grasps)

@@ -121,7 +121,9 @@ def live(stream: Stream, limits: RiskLimits, *, every: bool, scale: float = SCAL
     margins, ended = rows["margin"].tolist(), rows["slipped"].tolist()
     for index in np.flatnonzero(~rows["refused"]).tolist():
         margin, slipped, inputs = margins[index], ended[index], stream.features[index]
-        assessed = assess(learner, risk, sigmoid(margin), margin, inputs, name=(name, index))
+        assessed = assess(
+            learner, risk, sigmoid(margin), margin, inputs, name=(name, index), awaited=0
+        )
         p_slip[index] = assessed.p_slip
         supervised[index], outcomes[index] = assessed.supervised, assessed.outcomes
         stable[index] = assessed.permission is Permission.ALLOWED and p_slip[index] < 0.5

@@ -13,6 +13,7 @@ from msgspec.structs import replace
 
 from graspd.daemon.trust.lift_book import LIFTS_MAX, OutcomeStatus
 from graspd.daemon.trust.trust import DIGEST_BYTES, Trust, TrustState, decode, encode
+from graspd.models.trust.assessment import Assessment
 from graspd.models.trust.learner import Learner, sigmoid
 from graspd.models.trust.residual import GRASPS_MAX
 from graspd.models.trust.risk import Permission, RiskLimits
@@ -103,6 +104,7 @@ def test_an_announced_lift_is_not_counted_against_itself() -> None:
         ("0 1 refresh", 1),
         ("0 stable 1", 2),  # who does not ask lifts on `stable`
         ("0 offer stable 1", 0),
+        ("stable 1 offer", 1),
     ],
 )
 def test_an_outcome_teaches_the_judgement_that_the_lift_began_on(steps: str, taught: int) -> None:
@@ -125,7 +127,18 @@ def test_an_outcome_teaches_the_judgement_that_the_lift_began_on(steps: str, tau
     learner = Learner(INPUTS)
     learner.learn(np.frombuffer(features[taught], "<f8"), slipped=False)
     assert part.learner.state() == learner.state()
-    assert (part.risk.lifts, part.lifts.announced) == ("stable" in steps, 0)
+    assert (part.risk.lifts, part.lifts.announced) == ("stable" in steps, steps == "stable 1 offer")
+
+
+def test_judging_again_neither_clears_a_lesson_nor_teaches_after_an_exchange() -> None:
+    part = trust()
+    found = part.judge(named(1), 0.9, 2.2, inputs(0))
+    for worth in (found, Assessment(0)):
+        part.note(named(1), worth, stable=False, judged=True)
+        assert [lift.features for lift in part.state().lifts.records] == [found.features]
+    part.sensors_exchanged()
+    part.note(named(1), found, stable=False, judged=True)
+    assert [lift.features for lift in part.state().lifts.records] == [None]
 
 
 @pytest.mark.parametrize(

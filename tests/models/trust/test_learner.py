@@ -24,6 +24,15 @@ def test_margins_beyond_thirty_are_clipped_to_thirty() -> None:
             np.testing.assert_array_equal(found, [sign * 15.0, 1.0, 0.0, 0.0])
 
 
+def test_uncertainty_falls_from_one_until_a_reset() -> None:
+    learner = Learner(2)
+    assert learner.uncertainty == 1.0
+    learner.learn(learner.judge(0.0, np.array([1000.0, -1000.0]))[1], slipped=True)
+    assert 0.0 < learner.uncertainty < 1.0
+    learner.reset()
+    assert learner.uncertainty == 1.0
+
+
 def coin(random: np.random.Generator) -> bool:
     return bool(random.integers(0, 2))
 

@@ -85,6 +85,9 @@ def test_too_many_outstanding_announced_lifts_make_the_next_unproven() -> None:
     assert rule.decide(-9.0, awaited=1) is Permission.ALLOWED
     assert rule.decide(-9.0, awaited=2) is Permission.UNPROVEN
     assert rule.decide(-0.1, awaited=2) is Permission.WITHHELD
+    assert risk().decide(-9.0, awaited=4) is Permission.ALLOWED, "five by default"
+    assert risk().decide(-9.0, awaited=5) is Permission.UNPROVEN
+    assert Risk(RiskLimits(0.05, outstanding_max=1)).decide(-9.0) is Permission.ALLOWED
     assert risk(None).decide(-9.0, awaited=99) is Permission.ALLOWED
 
 
@@ -119,7 +122,7 @@ def test_an_exchange_may_lower_but_never_raises_the_budget(
 
 
 def test_a_share_of_withheld_grasps_is_lifted_under_supervision() -> None:
-    rule, none = risk(0.05, explore=0.05), risk(0.05)
+    rule, none = risk(0.05, explore=0.05), Risk(RiskLimits(0.05))
     chosen = [rule.supervised(Permission.WITHHELD, "boot", grasp) for grasp in range(20_000)]
     # Three standard deviations of the draws.
     assert abs(sum(chosen) / 20_000 - 0.05) < 3 * math.sqrt(0.05 * 0.95 / 20_000)
@@ -139,6 +142,7 @@ def test_a_share_of_withheld_grasps_is_lifted_under_supervision() -> None:
         RiskState(0.05, 9, 9, 9, -9.1),
         RiskState(0.05, 9, 3, 9, math.nan),
         RiskState(0.05, 3, 4, 9, 1.0),
+        RiskState(None, 0, 0, 0, 5.1),
     ],
 )
 def test_a_state_that_no_outcomes_lead_to_is_refused(state: RiskState) -> None:
@@ -147,3 +151,18 @@ def test_a_state_that_no_outcomes_lead_to_is_refused(state: RiskState) -> None:
     with pytest.raises(ValueError, match=r"budget|more slips"):
         rule.restore(state)
     assert rule.state() == before
+
+
+@pytest.mark.parametrize("state", [RiskState(0.05, 0, 0, 0, 5.0), RiskState(0.05, 9, 9, 9, -9.0)])
+def test_a_state_with_the_highest_or_lowest_budget_is_taken(state: RiskState) -> None:
+    rule = risk(0.05)
+    rule.restore(state)
+    assert rule.state() == state
+
+
+def test_a_bound_allows_five_slips_beyond_the_share() -> None:
+    rule = risk(0.05)
+    for _ in range(20):
+        rule.take(stable=True, slipped=False, proves=True)
+    assert rule.figures(0, 0, 0).beyond_share == pytest.approx(5.0)
+    assert risk(None).figures(0, 0, 0).beyond_share == 0.0
