@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from graspd.drivers.base import ElectrodeFault, RecordingError
 from graspd.drivers.recordings.kinds import open_recording
 from graspd.drivers.recordings.layout import survey
-from graspd.drivers.recordings.values import count_of, time_of
+from graspd.drivers.recordings.values import count_of, problem_with, time_of
 from tests.drivers.recordings.tables import (
     ELECTRODES,
     FINGERS,
@@ -290,15 +290,12 @@ def scaled(change: Callable[[int], str], separator: str = ",") -> bytes:
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (scaled(lambda n: f"{n / 4095:.4f}"), "normalised? multiply by 4095"),
         (scaled(lambda n: f"{n / 4095 * 3.3:.3f}"), "volts?"),
-        (scaled(lambda n: f"{n // 2}.5"), "means of several readings?"),
         (scaled(lambda n: str(n - 1100)), "differences?"),
         (scaled(lambda n: str(n * 16)), "another sensor, or another scale?"),
         (scaled(lambda n: f'"{n // 1000},{n % 1000:03}"'), "without a separator of thousands"),
         (scaled(lambda n: f"{n // 1000} {n % 1000:03}", ";"), "without a separator of thousands"),
         (scaled(lambda n: f"{n / 1000:.3f}", ";"), "thousands with a point, or volts?"),
-        (scaled(lambda n: f"{n / 40.95:.2f}"), "percent, or another scale?"),
         (scaled(lambda _: "0.99"), "normalised? multiply by 4095"),
         (scaled(lambda _: "5.5"), "volts?"),
         (scaled(lambda _: "5.6"), "percent, or another scale?"),
@@ -315,6 +312,13 @@ def test_values_that_are_not_counts_are_refused_with_a_guess(content: bytes, sai
     assert said in message
 
 
+def test_half_unread_or_a_twentieth_scaled_values_are_allowed() -> None:
+    for cell, most, of in (("x", 10, 20), ("1.5", 1, 20), ("-2", 1, 20), ("-1", 1, 2)):
+        allowed, counts = [cell] * most, ["2000"] * (of - most)
+        assert problem_with([*allowed, *counts, "", ""], decimal_comma=False) is None
+        assert problem_with([*allowed, *counts[1:], "", ""], decimal_comma=False) is not None
+
+
 def test_joints_in_degrees_are_refused() -> None:
     degrees = {"FFJ1": ["1", "2", "3", "1"], "rh_FFJ3": ["45.8", "46.1", "46.0", "3"]}
     content = stream(TIMES, degrees)
@@ -323,10 +327,11 @@ def test_joints_in_degrees_are_refused() -> None:
     assert "FFJ1 [deg]: angles are in degrees: write radians" in refusal(named)
 
 
-def test_a_single_angle_beyond_reach_becomes_nan() -> None:
-    angles = ["0.5", "70", *["0.5"] * 18]
-    rows = rows_of(stream([f"{n / 100}" for n in range(20)], {"FFJ3": angles}))
-    assert [math.isnan(row.position_rad[0]) for row in rows] == [False, True, *[False] * 18]
+def test_up_to_a_tenth_of_angles_beyond_reach_become_nan() -> None:
+    times, angles = [f"{n / 100}" for n in range(20)], ["0.5", "70", "70", *["0.5"] * 17]
+    rows = rows_of(stream(times, {"FFJ3": angles}))
+    assert [math.isnan(row.position_rad[0]) for row in rows] == [False, True, True, *[False] * 17]
+    assert "70 rad is beyond" in refusal(stream(times, {"FFJ3": ["70", *angles[1:]]}))
 
 
 @pytest.mark.parametrize(

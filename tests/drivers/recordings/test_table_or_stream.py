@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -44,12 +45,38 @@ def test_the_unit_of_times_is_known_by_their_steps(tmp_path: Path, unit_s: float
     assert (found.is_stream, found.unit_s, found.has_outcomes) == (True, unit_s, True)
 
 
-@pytest.mark.parametrize(("step", "unit_s"), [(1.9, 1.0), (2, 1e-3), (500, 1e-3), (501, 1.0)])
-def test_times_2_to_500_ms_apart_may_be_milliseconds(
-    tmp_path: Path, step: float, unit_s: float
+@pytest.mark.parametrize(
+    ("first", "step", "unit_s"),
+    [
+        *((0, 1.9, 1.0), (0, 2, 1e-3), (0, 500, 1e-3), (0, 501, 1.0)),
+        *((0.9e11, 1, 1.0), (1.1e11, 1, 1e-3), (0.9e14, 1, 1e-3), (1.1e14, 1, 1e-6)),
+        *((0.9e17, 100, 1e-6), (1.1e17, 100, 1e-9)),
+    ],
+)
+def test_the_unit_of_times_is_known_by_step_or_size(
+    tmp_path: Path, first: float, step: float, unit_s: float
 ) -> None:
-    path = write(tmp_path, stream([f"{step * row}" for row in range(4)]))
+    """By steps of 2 to 500 ms, or by the size of a time since 1970, as 1.1e11 ms of 1973."""
+    path = write(tmp_path, stream([f"{first + step * row}" for row in range(4)]))
     assert layout_of(path, FINGERS, "stream").unit_s == unit_s
+
+
+@pytest.mark.parametrize(
+    ("times", "said"),
+    [
+        *(([0.99 * n for n in range(12)], None), (range(12), "rows are 1 apart")),
+        ([*[0, -1] * 2, *[0.1 * n for n in range(16)]], None),
+        ([*[0, -1] * 3, *[0.1 * n for n in range(14)]], "3 of 20 rows have a time before"),
+        *(([0, -0.1] * 5, "5 of 10 rows"), ([0, -0.1] * 4, None)),
+        *(([1] * 10, "most rows have the time of the row before"), ([1] * 9, None)),
+    ],
+)
+def test_times_of_a_stream_rise_by_less_than_a_second(
+    tmp_path: Path, times: Sequence[float], said: str | None
+) -> None:
+    path = write(tmp_path, stream([f"{t:g}" for t in times]))
+    with nullcontext() if said is None else pytest.raises(RecordingError, match=said):
+        assert layout_of(path, FINGERS).is_stream
 
 
 @pytest.mark.parametrize(
@@ -163,13 +190,10 @@ def test_rows_are_labelled_if_lifts_ended_in_both_ways(cells: Sequence[str], bot
 @pytest.mark.parametrize(
     ("near", "between", "far", "labelled", "read_as", "said"),
     [
-        (4, 0, 16, True, None, None),
-        (5, 0, 15, True, None, "5 of 20 rows nearly repeat another: sweeps of"),
-        (4, 9, 7, True, None, None),
-        (4, 10, 6, True, None, "most of 20 rows are much like another: sweeps of"),
+        *((4, 0, 16, True, None, None), (5, 0, 15, True, None, "5 of 20 rows nearly repeat")),
+        *((4, 9, 7, True, None, None), (4, 10, 6, True, None, "most of 20 rows are much like")),
+        *((2, 8, 10, False, None, None), (2, 9, 9, False, None, "most of 20 rows")),
         (3, 0, 17, False, None, "3 of 20 rows nearly"),
-        (2, 8, 10, False, None, None),
-        (2, 9, 9, False, None, "most of 20 rows"),
         *((18, 2, 0, False, "table", None), (17, 3, 0, False, "table", "change as sweeps")),
         *((14, 3, 2, False, "table", None), (13, 4, 2, False, "table", "change as sweeps")),
         *((49, 0, 1, False, "table", None), (50, 0, 1, False, "table", "change as sweeps")),

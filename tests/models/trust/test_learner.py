@@ -17,20 +17,11 @@ ONE_FINGER, THREE_FINGERS = 26, 78
 
 
 def test_margins_beyond_thirty_are_clipped_to_thirty() -> None:
-    learner, x = Learner(2), np.zeros(2)
+    learner, x = Learner(2), np.array([1000.0, -1000.0])
     for margin in (30.5, 1e9):
         for sign in (1.0, -1.0):
             _, found = learner.judge(sign * margin, x)
-            np.testing.assert_array_equal(found, [sign * 15.0, 1.0, 0.0, 0.0])
-
-
-def test_uncertainty_falls_from_one_until_a_reset() -> None:
-    learner = Learner(2)
-    assert learner.uncertainty == 1.0
-    learner.learn(learner.judge(0.0, np.array([1000.0, -1000.0]))[1], slipped=True)
-    assert 0.0 < learner.uncertainty < 1.0
-    learner.reset()
-    assert learner.uncertainty == 1.0
+            np.testing.assert_array_equal(found, [sign * 15.0, 1.0, *x])
 
 
 def coin(random: np.random.Generator) -> bool:
@@ -61,6 +52,7 @@ KINDS: dict[str, Callable[[np.random.Generator, int], tuple[float, ArrayLike, bo
 def test_any_outcomes_leave_a_bounded_positive_definite_covariance(kind: str) -> None:
     random, number = np.random.default_rng(0), 2500 if kind == "all in turns" else 500
     learner = Learner(ONE_FINGER)
+    assert learner.uncertainty == 1.0
     weights_prior = [0.5**2, 0.5**2] + [0.2**2] * ONE_FINGER
     for index in range(number):
         margin, inputs, slipped = KINDS[kind](random, index)
@@ -73,6 +65,7 @@ def test_any_outcomes_leave_a_bounded_positive_definite_covariance(kind: str) ->
             assert np.linalg.eigvalsh(matrix)[0] >= 0.99 * 2e-3 * 0.009
             assert (np.abs(mean) <= 25.0 * (1.0 + 1e-12)).all()
     assert learner.outcomes == number
+    assert 0.0 < learner.uncertainty < 1.0
     Learner(ONE_FINGER).restore(learner.state())
 
 

@@ -7,7 +7,7 @@ import pytest
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
 from graspd.models.trust import learner as learner_module
-from graspd.models.trust.learner import Learner
+from graspd.models.trust.learner import Learner, LearnerState, of_format_2
 from graspd.models.trust.residual import GRASPS_MAX, Residual
 from tests.models.trust.reference import Reference
 from tests.models.trust.streams import lifts
@@ -56,8 +56,12 @@ def test_the_learner_equals_a_dense_computation_over_all_grasps(
             assert found == pytest.approx(reference.log_odds(other), abs=1e-9)
     if kept > 40:
         expected = reference.state(list(range(40)) if inputs else [])
-        for array, dense in zip(learner.at_told(), expected, strict=True):
-            np.testing.assert_allclose(array, dense.astype(float), rtol=0.0, atol=1e-9)
+        mean, covariance = (each.tobytes() for each in learner.at_told())
+        later = Learner(inputs)
+        later.restore(of_format_2(LearnerState(40, mean, covariance, learner.state().grasps)))
+        for each in (learner, later):
+            for array, dense in zip(each.at_told(), expected, strict=True):
+                np.testing.assert_allclose(array, dense.astype(float), rtol=0.0, atol=1e-9)
 
 
 def test_rounding_of_many_outcomes_does_not_add_up(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -36,6 +36,7 @@ def test_stable_ends_within_nine_lifts_if_all_of_them_slip(alpha: float) -> None
         lift(rule, -1e9, lambda stable: stable)
         assert rule.slips <= alpha * rule.lifts + START + ROUNDING
         assert rule.bound == pytest.approx(alpha * rule.lifts + START)
+        assert rule.figures(0, 0, 0).beyond_share == pytest.approx(START)
     assert rule.slips == rule.lifts <= 9
     assert rule.decide(-1e9) is Permission.RISK_EXCEEDED
     # Less than one slip is left, and what it costs.
@@ -89,6 +90,7 @@ def test_too_many_outstanding_announced_lifts_make_the_next_unproven() -> None:
     assert risk().decide(-9.0, awaited=5) is Permission.UNPROVEN
     assert Risk(RiskLimits(0.05, outstanding_max=1)).decide(-9.0) is Permission.ALLOWED
     assert risk(None).decide(-9.0, awaited=99) is Permission.ALLOWED
+    assert risk(None).figures(0, 0, 0).beyond_share == 0.0
 
 
 def test_the_warm_up_requests_supervised_lifts_of_unsure_grasps() -> None:
@@ -151,18 +153,7 @@ def test_a_state_that_no_outcomes_lead_to_is_refused(state: RiskState) -> None:
     with pytest.raises(ValueError, match=r"budget|more slips"):
         rule.restore(state)
     assert rule.state() == before
-
-
-@pytest.mark.parametrize("state", [RiskState(0.05, 0, 0, 0, 5.0), RiskState(0.05, 9, 9, 9, -9.0)])
-def test_a_state_with_the_highest_or_lowest_budget_is_taken(state: RiskState) -> None:
-    rule = risk(0.05)
-    rule.restore(state)
-    assert rule.state() == state
-
-
-def test_a_bound_allows_five_slips_beyond_the_share() -> None:
-    rule = risk(0.05)
-    for _ in range(20):
-        rule.take(stable=True, slipped=False, proves=True)
-    assert rule.figures(0, 0, 0).beyond_share == pytest.approx(5.0)
-    assert risk(None).figures(0, 0, 0).beyond_share == 0.0
+    for taken in (RiskState(0.05, 0, 0, 0, 5.0), RiskState(0.05, 9, 9, 9, -9.0)):
+        rule = risk(0.05)
+        rule.restore(taken)
+        assert rule.state() == taken
