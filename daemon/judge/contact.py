@@ -265,8 +265,8 @@ class Contact:
         `usable`: False for electrodes to ignore; None: use all.
         """
         falls, numbers = self._falls(median, usable)
-        elapsed_s = 0.0 if self._last_ns is None else max(t_ns - self._last_ns, 0) / 1e9
-        self._last_ns = t_ns
+        last_ns = t_ns if self._last_ns is None else min(self._last_ns, t_ns)
+        elapsed_s, self._last_ns = (t_ns - last_ns) / 1e9, t_ns
         self.window.add(counts, usable)
         middles = [0.0] * len(numbers)
         all_touch = True
@@ -320,8 +320,8 @@ class Contact:
     def _settle(self, finger: int, rest: Rest, t_ns: int) -> None:
         """Adopt `rest` as a finger's tare; a known baseline changes at most at the speed limits."""
         touch, former, baseline = self.touches[finger], self.baseline[finger], rest.baseline
-        elapsed_s = 0.0 if touch.tared_ns is None else max(t_ns - touch.tared_ns, 0) / 1e9
-        touch.tared_ns = t_ns
+        last_ns = t_ns if touch.tared_ns is None else min(touch.tared_ns, t_ns)
+        elapsed_s, touch.tared_ns = (t_ns - last_ns) / 1e9, t_ns
         if self.tared[finger]:
             lowest = former - DOWN_COUNTS_PER_S * elapsed_s
             highest = former + UP_COUNTS_PER_S * elapsed_s

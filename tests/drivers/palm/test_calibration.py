@@ -159,7 +159,7 @@ TAKEN = [
     *(single("FFJ1", POINTS[:number]) for number in (2, 64)),
     *(coupled(PAIRS[:number]) for number in (3, 49)),
     *(single("FFJ1", [[1000, 0.0], [1100, 50.0]]), coupled(steep(0.5))),
-    single("FFJ4", [[1000, -30.0], [3000, 30.0]]),
+    *(single("FFJ4", [[1000, first], [3000, last]]) for first, last in ((-30.0, 30.0), (0.5, 0.0))),
 ]
 
 
