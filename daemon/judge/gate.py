@@ -108,6 +108,8 @@ class Question:
         """True while the controller waits for a judgement."""
         self._until_ns: int | None = None
         """Time at which the question is dropped, ns. None: no reading came since the question."""
+        self._judged_ns = 0
+        """Time of the last judgement."""
 
     def ask(self) -> None:
         """Note a question of the controller. Its timeout runs from the next reading on."""
@@ -139,9 +141,7 @@ class Question:
         Return True for the first, and with `on_request` if it answers a question; else False.
         """
         answers = first or (self.asked and self._on_request)
-        self.asked = False
-        self._judged_ns = t_ns
-        """Time of the last judgement."""
+        self._judged_ns, self.asked = t_ns, False
         return answers
 
     def restart(self) -> None:
@@ -166,6 +166,8 @@ class Gate:
         """Counts at the first judgement after settling, shape (fingers, 24); meaningless before."""
         self._last_ns: int | None = None
         """Time of the last reading."""
+        self._opened_ns = 0
+        """Time of the end of the last touch."""
         self._objections: tuple[Reason, ...] = (Reason.NO_CONTACT,)
         """Reasons of the last reading against settling."""
         unknown: dict[Finger, float | None] = dict.fromkeys(fingers)
@@ -298,7 +300,6 @@ class Gate:
             self._go(ways.TOUCHED, t_ns)
         elif not touches and phase.state in ways.OPENED.states:
             self._opened_ns = t_ns
-            """Time of the end of the last touch."""
             self._go(ways.OPENED, t_ns)
 
     def _follow_judged(
@@ -317,7 +318,7 @@ class Gate:
         # Whole numbers below 2**16: float32 adds 24 of them exactly.
         distance = np.abs(median.astype(np.float32) - self._reference)
         if usable is not None:
-            distance *= usable * (ELECTRODES / usable.sum(axis=1, keepdims=True))
+            distance *= usable * (ELECTRODES / np.maximum(usable.sum(axis=1, keepdims=True), 1))
         if max(distance.dot(ONES).tolist()) > CHANGE_COUNTS * ELECTRODES:
             self._go(ways.CHANGED, t_ns)
             return ()
