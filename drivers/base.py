@@ -27,9 +27,9 @@ ANGLE_MAX_RAD = math.radians(200)
 """Largest angle, rad: J0, the sum of two joints, reaches 180 degrees. More is another unit."""
 
 
-def joint_name(column: str) -> str | None:
-    """Return the joint of a column (`rh_FFJ3` gives `FFJ3`); None if it names no joint."""
-    name = column[3:] if column.startswith(("rh_", "lh_")) else column
+def joint_name(name: str) -> str | None:
+    """Return the joint of a message's name (`rh_FFJ3` gives `FFJ3`); None if it names no joint."""
+    name = name[3:] if name.startswith(("rh_", "lh_")) else name
     return name if name in JOINTS else None
 
 

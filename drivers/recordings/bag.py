@@ -222,7 +222,8 @@ class _Bag:
                 t_ns = stamp.sec * 1_000_000_000 + stamp.nanosec
                 if connection.msgtype == JOINTS:
                     message.name = [
-                        "" if name.startswith(self._others) else name for name in message.name
+                        "" if name.lower().startswith(self._others) else name
+                        for name in message.name
                     ]
                 yield t_ns or bag_ns, message
         except _DAMAGE as error:
@@ -363,7 +364,7 @@ def _joints(t_ns: int, message: Any) -> JointReading | None:  # noqa: ANN401
     """Return the angles of a hand's joints in a message; None: it has none."""
     angles: dict[str, float] = {}
     for name, angle in zip(message.name, message.position, strict=False):
-        if joint := joint_name(name):
+        if joint := joint_name(name.upper().removeprefix("RH_").removeprefix("LH_")):
             # `rh_FFJ3` and `lh_FFJ3` are one joint with two angles, of which neither is trusted.
             angles[joint] = math.nan if joint in angles else float(angle)
     if not angles:

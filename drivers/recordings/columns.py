@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from graspd.biotac import ELECTRODES, FINGERS, FORMER_ELECTRODES, Finger
-from graspd.drivers.base import RecordingError, joint_name
+from graspd.drivers.base import JOINTS, RecordingError
 from graspd.drivers.recordings.kinds import PAGE
 from graspd.drivers.recordings.values import are_numbers, number_of, time_of
 
@@ -79,6 +79,21 @@ _OF_A_FINGER: Final = re.compile(
     r"(?:finger(?:[_ ]?tip)?|digit|sensor|biotac|tip)(?:[_ ]?(?:name|id|no|nr|index))?|frame_id",
     re.IGNORECASE,
 )
+_JOINT: Final = re.compile(
+    rf"(?:[rl]h_)?(?P<joint>{'|'.join(f'{each[:2]}[_ .-]?{each[2:]}' for each in JOINTS)})(?!\d)",
+    re.IGNORECASE,
+)
+_WORD: Final = re.compile("[^\\W_]+|[\N{DEGREE SIGN}\N{RING ABOVE}]")
+_DEGREES: Final = re.compile("deg.*|[\N{DEGREE SIGN}\N{RING ABOVE}\N{MASCULINE ORDINAL INDICATOR}]")
+"""Words of degrees. Keyboards have three signs for them."""
+_ANGLE: Final = re.compile("angles?|hand|joints?|lh|pos|positions?|q|rad|radians?|rh|states?")
+"""Words of the angle of a joint: `FFJ3_position`, `/joint_states/rh_FFJ3/position`."""
+_NO_ANGLE: Final = re.compile(
+    "acc|acceleration|cmd|command(?:ed|s)?|desired|dot|efforts?|err|error|force|goal|limits?|max"
+    "|min|n|nm|ref|reference|s|set|setpoint|speed|targets?|temp|temperature|torques?|v|vel"
+    "|velocit(?:y|ies)|voltage"
+)
+"""Words of other values of a joint: `FFJ3_effort`, `FFJ3 [rad/s]`, `FFJ3_target`."""
 UNITS: Final = frozenset((*_UNIT_S, "counts", "count", "raw", "adc", "lsb", "bits", "rad", "deg"))
 
 
@@ -122,6 +137,10 @@ class Columns:
     """Finger by finger, E1 to E24 each."""
     joints: Mapping[str, int]
     """Place of a joint, by its name without hand prefix."""
+    degrees: tuple[str, ...]
+    """Names of joints' angles in degrees; those that are in radians too are not among them."""
+    unclear: tuple[str, ...]
+    """Names that may be of the angle of a joint, of which no other is known."""
     time: TimeColumn | None
     object: int | None
     slipped: int | None
@@ -139,19 +158,12 @@ class Columns:
     def of(cls, path: Path, names: Sequence[str], fingers: Sequence[str], line: int) -> Columns:
         """Return the columns to read for `fingers`; without any, for all that the file has.
 
-        `names`: the header, at line `line`. Raises `RecordingError` for columns that are missing,
-        occur twice or are in degrees, and for electrodes whose finger is not clear.
+        `names`: the header, at line `line`. Raises `RecordingError` for columns that are missing or
+        occur twice, and for electrodes whose finger is not clear.
         """
         plain = [_UNIT.sub("", name) for name in names]
         found = _electrodes(path, plain, fingers, line)
-        joints: dict[str, int] = {}
-        for place, name in enumerate(plain):
-            if joint := joint_name(name):
-                if "deg" in names[place] or "\N{DEGREE SIGN}" in names[place]:
-                    problem = "angles are in degrees: write radians"
-                    raise RecordingError(path, problem, line=line, column=names[place])
-                _refuse_twice(path, names, line, joints.get(joint), place)
-                joints[joint] = place
+        joints, degrees, unclear = _joints(path, names, line)
         time = time_column(names)
         single: dict[str, int] = {}
         labels = _labels(names)
@@ -169,6 +181,8 @@ class Columns:
                 found[finger][number] for finger in fingers or every for number in range(ELECTRODES)
             ),
             joints=joints,
+            degrees=degrees,
+            unclear=unclear,
             time=time,
             object=single.get(OBJECT),
             slipped=single.get(SLIPPED),
@@ -209,6 +223,36 @@ def with_units(names: Sequence[str], cells: Sequence[str]) -> list[str] | None:
     if not given or not given <= UNITS:
         return None
     return [f"{name} [{unit}]" if unit else name for name, unit in zip(names, units, strict=False)]
+
+
+def _joints(
+    path: Path, names: Sequence[str], line: int
+) -> tuple[dict[str, int], tuple[str, ...], tuple[str, ...]]:
+    """Return `joints`, `degrees` and `unclear` of `Columns`. Raises for an angle given twice."""
+    plain, worded, degrees, unclear = (dict[str, list[int]]() for _ in range(4))
+    for place, name in enumerate(names):
+        match, rest = _JOINT.search(name), _JOINT.sub(" ", name, count=1).lower()
+        words, bare = _WORD.findall(rest), _WORD.findall(_UNIT.sub("", rest))
+        if match is None or any(map(_NO_ANGLE.fullmatch, words)):
+            continue
+        if any(map(_DEGREES.fullmatch, words)):
+            kind = degrees
+        elif all(map(_ANGLE.fullmatch, bare)):
+            kind = worded if bare else plain
+        else:
+            kind = unclear
+        kind.setdefault(re.sub("[_ .-]", "", match["joint"]).upper(), []).append(place)
+    found = worded | plain
+    for first, *others in found.values():
+        if others:
+            _refuse_twice(path, names, line, first, others[0])
+    in_degrees, may_be = (
+        tuple(
+            names[place] for each, places in kind.items() if each not in found for place in places
+        )
+        for kind in (degrees, unclear)
+    )
+    return {joint: places[0] for joint, places in found.items()}, in_degrees, may_be
 
 
 def _electrodes(
@@ -275,7 +319,8 @@ def _whole(
         numbers = found.get(finger, {})
         missing = [number for number in expected if number not in numbers]
         if missing:
-            column = re.sub(r"^ff|(?<=tactiles)0", _written(example, finger), example)
+            written = str(_PLACES[finger]) if "tactiles" in example else finger
+            column = re.sub(r"^ff|(?<=tactiles)0", written, example)
             column = re.sub(r"\d+$", str(missing[0]), column)
             others = f", the first of {len(missing)} that are" if len(missing) > 1 else ""
             problem = f"this column is missing{others}; the file has the fingers {', '.join(there)}"
@@ -301,10 +346,6 @@ def problem_of_fingers(named: Iterable[str]) -> str | None:
     """Return why rows that are named so are not of one finger; None: one name at most."""
     first = sorted(named)[:2]
     return f"has rows of {' and of '.join(first)}: {ONE_ROW}" if len(first) > 1 else None
-
-
-def _written(example: str, finger: str) -> str:
-    return str(_PLACES[finger]) if "tactiles" in example else finger
 
 
 def _nearest(names: Sequence[str]) -> str:

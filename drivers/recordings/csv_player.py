@@ -105,6 +105,10 @@ class ReplayDriver(ReadingsDriver[tuple[Row, bool]]):
             if layout.unit_s != 1.0 and layout.columns.time is not None:
                 name, unit = layout.columns.time.name, UNITS[layout.unit_s]
                 _log.info("replay: %s: the times of column %s are in %s", path, name, unit)
+            if layout.is_stream and layout.columns.unclear:
+                names = ", ".join(map(repr, layout.columns.unclear[:IGNORED_COLUMNS_LOGGED]))
+                problem = "%s: %s may be a joint's angle, and is not read: name it FFJ3, in radians"
+                _log.warning(problem, path, names)
             if layout.unread_outcome and not self._refuses["outcomes"]:
                 _log.warning("no outcome is known: %s", layout.unread_outcome)
         if ignored:

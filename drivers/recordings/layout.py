@@ -47,8 +47,7 @@ NEAR_SHARE_MAX: Final = 0.2
 """Largest share of rows up to `NEAR_COUNTS` from another in a grasp table."""
 ALIKE_SHARE_MAX: Final = 0.85
 """Largest share, in a grasp table, of rows up to `STEP_COUNTS` from another; rows within
-`NEAR_COUNTS` count twice. In noisy streams up to 100 % are within `STEP_COUNTS`, none nearer.
-"""
+`NEAR_COUNTS` count twice. In noisy streams up to 100 % are within `STEP_COUNTS`, none nearer."""
 DOUBTED_SHARES: Final = 0.1, 0.6
 """`NEAR_SHARE_MAX` and `ALIKE_SHARE_MAX` for rows with neither both outcomes nor `read_as`.
 
@@ -204,7 +203,9 @@ class _Rows:
             self.refuse_fingers_by_row()
 
     def refuse_degrees(self) -> None:
-        """Raise if over a tenth of a joint's angles are, as radians, beyond every joint's reach."""
+        """Raise if a joint's name says degrees, or over a tenth of its angles are beyond reach."""
+        if names := self.columns.degrees:
+            raise RecordingError(self.path, "angles are in degrees: write radians", column=names[0])
         for name, place in self.columns.joints.items():
             angles = [number_of(row[place], decimal_comma=self._comma) for row in self.first]
             large = [angle for angle in angles if angle is not None and abs(angle) > ANGLE_MAX_RAD]
@@ -213,8 +214,7 @@ class _Rows:
                 raise RecordingError(self.path, problem)
 
     def is_timed(self, read_as: ReadAs | None, rate_hz: float | None) -> bool:
-        """Return True for a stream: by `read_as`, or if None, for rows with times. Raises for
-        `stream` without times or rate."""
+        """Return True for a stream, by `read_as` or times; raise for one without times or rate."""
         if read_as == "stream" and self.columns.time is None and rate_hz is None:
             raise RecordingError(self.path, "has no column of times: give --rate-hz too")
         return read_as == "stream" or (read_as is None and self.columns.time is not None)

@@ -290,6 +290,15 @@ def test_the_joints_of_the_other_hand_are_left_out(tmp_path: Path) -> None:
     assert (read_recording(left)["FFJ3"] == demo()["FFJ3"][:30]).all()
 
 
+@pytest.mark.parametrize("prefix", ["", "rh_", "RH_"])
+def test_joints_in_a_bag_are_known_in_any_case(tmp_path: Path, prefix: str) -> None:
+    angles = {prefix + "FFJ3": 0.5, prefix + "thj5": 0.7, "LH_THJ2": 0.1}
+    path = BagOf(1).write(tmp_path / "hand.bag", [noise(1)[0]._replace(angles=angles)])
+    frame = read_recording(path)
+    assert (frame["FFJ3"].tolist(), frame["THJ5"].tolist()) == ([0.5], [0.7])
+    assert "THJ2" not in frame
+
+
 def test_a_joint_reported_for_both_hands_has_no_angle(tmp_path: Path) -> None:
     angles = {"rh_FFJ3": 0.5, "lh_FFJ3": 0.6, "rh_THJ5": 0.7}
     sweeps = [sweep._replace(angles=angles) for sweep in noise(3)]

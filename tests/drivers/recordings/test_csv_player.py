@@ -168,6 +168,15 @@ def test_unknown_columns_of_all_files_are_logged_once(
     assert record.getMessage().endswith("'x8'"), "ten names"
 
 
+def test_a_column_that_may_be_an_angle_is_warned_of(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    content = stream(["0", "0.01"], {"FFJ3_filtered": ["0.1"] * 2, "FFJ3_effort": ["1"] * 2})
+    play(ReplayDriver([write(tmp_path, content)], speed=None))
+    (record,) = (record for record in caplog.records if record.levelname == "WARNING")
+    assert "'FFJ3_filtered' may be a joint's angle, and is not read" in record.getMessage()
+
+
 @pytest.mark.parametrize(("name", "unit"), [("t_ms", ["ms"]), ("t", [])])
 def test_a_unit_of_times_other_than_seconds_is_logged(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, name: str, unit: list[str]

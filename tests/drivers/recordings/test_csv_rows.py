@@ -323,8 +323,50 @@ def test_joints_in_degrees_are_refused() -> None:
     degrees = {"FFJ1": ["1", "2", "3", "1"], "rh_FFJ3": ["45.8", "46.1", "46.0", "3"]}
     content = stream(TIMES, degrees)
     assert "FFJ3 = 45.8 rad is beyond every joint: degrees?" in refusal(content)
-    named = content.replace(b"FFJ1", b"FFJ1 [deg]")
-    assert "FFJ1 [deg]: angles are in degrees: write radians" in refusal(named)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("FFJ1 [deg]", "FFJ1 (°)", "FFJ1 [°]", "FFJ1°", "FFJ1 (º)", "FFJ1 (˚)", "FFJ1 [Degrees]"),
+        *("FFJ1_deg", "rh_ffj1_position_degrees", "/joint_states/rh_FFJ1/position (deg)"),
+    ],
+)
+def test_joints_named_in_degrees_are_refused_in_streams_only(name: str) -> None:
+    content = stream(TIMES, {name: ["1", "2", "3", "1"], "FFJ2": ["0"] * 4})
+    assert f"column {name}: angles are in degrees: write radians" in refusal(content)
+    in_radians = content.replace(b"FFJ2", b"FFJ1")
+    assert rows_of(in_radians)[0].joint_names == ("FFJ1",)
+    grasps = table(3, {row: {name: "1"} for row in range(3)}, [*TABLE_HEADER, name])
+    assert len(rows_of(grasps)) == 3
+
+
+@pytest.mark.parametrize(
+    ("names", "joints", "unclear"),
+    [
+        (["ffj3", "Rh_ThJ5"], ("FFJ3", "THJ5"), ()),
+        (["FFJ3 (rad)", "MFJ3_rad", "lfj5 [ rad ]"], ("FFJ3", "LFJ5", "MFJ3"), ()),
+        (["FFJ3.position", "position.rh_FFJ2", "MFJ3Pos"], ("FFJ2", "FFJ3", "MFJ3"), ()),
+        (["/joint_states/rh_FFJ3/position", "/joint_states/rh_FFJ3/velocity"], ("FFJ3",), ()),
+        (["ff_j3", "joint_angle_TH-J2"], ("FFJ3", "THJ2"), ()),
+        (["FFJ3 (proximal)", "FFJ3_deg", "FFJ3_position", "FFJ3.1"], ("FFJ3",), ()),
+        (["FFJ3_velocity", "FFJ3_effort", "FFJ3 torque", "FFJ3_target", "ffj3_cmd"], (), ()),
+        (["FFJ3 [rad/s]", "FFJ3 (Nm)", "FFJ3_deg/s"], (), ()),
+        (["sh_rh_ffj3_position_controller.command", "FFJ5", "FFJ31"], (), ()),
+        (
+            ["FFJ3_filtered", "FFJ3_2", "MFJ3 smooth", "MFJ3"],
+            ("MFJ3",),
+            ("FFJ3_filtered", "FFJ3_2"),
+        ),
+        (["rh_FFJ3_current_position"], (), ("rh_FFJ3_current_position",)),
+    ],
+)
+def test_angles_of_joints_are_known_by_what_columns_say(
+    names: Sequence[str], joints: Sequence[str], unclear: Sequence[str]
+) -> None:
+    content = stream(TIMES, {name: ["0.1"] * 4 for name in names})
+    columns = survey(PATH, io.BytesIO(content), FINGERS).columns
+    assert (tuple(sorted(columns.joints)), columns.unclear) == (joints, unclear)
 
 
 def test_up_to_a_tenth_of_angles_beyond_reach_become_nan() -> None:
