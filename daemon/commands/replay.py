@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -173,7 +174,7 @@ def run(args: argparse.Namespace) -> int:
         with StopSignal() as stop, files_of(args.recordings) as args.recordings:
             return _replay(args, stop)
     except RecordingError as error:
-        if error.path.exists() or error.path.stem not in {table.name for table in TABLES}:
+        if os.path.exists(error.path) or error.path.stem not in {table.name for table in TABLES}:
             raise
         raise UsageError(f"{error}; `graspd data` gets it") from error
     except PublishError as error:

@@ -122,6 +122,11 @@ def test_a_replayed_table_keeps_the_risk_limit_and_reports_it() -> None:
     assert bare["reasons"].get("unproven") is None
 
 
+def test_a_recording_whose_path_cannot_exist_is_wrong_input() -> None:
+    refused = graspd("replay", "a" * 300)
+    assert (refused.returncode, refused.stderr[-21:]) == (2, ": file name too long\n")
+
+
 def test_a_streams_unreadable_outcome_is_refused_if_told(tmp_path: Path) -> None:
     header, row, *_ = DEMO_RECORDING.read_text().splitlines()
     place = header.split(",").index("slipped")
