@@ -161,7 +161,8 @@ def kind_of_open(path: Path, file: BinaryIO) -> Kind:
         raise RecordingError(path, "the file is empty")
     kind = _kind_of(head)
     if kind is None:
-        looks = next((text for magic, text in _OTHERS.items() if head.startswith(magic)), None)
+        start = _in_utf_8(head)
+        looks = next((text for magic, text in _OTHERS.items() if start.startswith(magic)), None)
         problem = "is of a kind that is not known" if looks is None else f"looks like {looks}"
         raise RecordingError(path, f"{problem}; {PAGE} lists what graspd reads")
     return kind
@@ -197,9 +198,7 @@ def _kind_of(head: bytes) -> Kind | None:
     for magic, kind in _MAGIC.items():
         if head.startswith(magic):
             return kind
-    encoding = encoding_of(head)
-    if encoding is not None:
-        head = head.decode(encoding, "replace").encode()
+    head = _in_utf_8(head)
     if any(head.startswith(magic) for magic in _OTHERS):
         return None
     if _ASC_LINE.search(head):
@@ -215,6 +214,12 @@ def _kind_of(head: bytes) -> Kind | None:
         text = head.rstrip(b"\0")  # a computer that lost power leaves zeros
         return Kind.TEXT if text and b"\0" not in text else None
     return Kind.TEXT
+
+
+def _in_utf_8(head: bytes) -> bytes:
+    """Return the first bytes of a text of another encoding in UTF-8; any others as they are."""
+    encoding = encoding_of(head)
+    return head if encoding is None else head.decode(encoding, "replace").encode()
 
 
 def encoding_of(head: bytes) -> str | None:
