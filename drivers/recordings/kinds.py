@@ -105,7 +105,8 @@ _OTHERS: Final = {
     b"\xd0\xcf\x11\xe0": "an old Excel workbook: save the sheet as CSV",
     b"\x89HDF": "HDF5: write the table as CSV or Parquet",
     b"MATLAB": "a MATLAB file: write the table as CSV",
-    b"\x93NUMPY": "a NumPy array: write CSV with a header, or give the array to graspd.load()",
+    b"\x93NUMPY": "a NumPy array: write CSV with a header; in Python "
+    'graspd.load("small-session").predict(array) takes it',
     b"\x80": "a Python pickle: write the table as CSV or Parquet",
     b"ARROW1": "Arrow or Feather: write the table as Parquet",
     b"\xff\xff\xff\xff": "a stream of Arrow: write the table as Parquet",

@@ -108,6 +108,7 @@ OTHERS: dict[str, tuple[bytes | Callable[[Path], None], str]] = {
     "other SQLite": (bag2("create table x (y integer);"), "an SQLite database without"),
     "can_logger": (b"Timestamp:     1.500000    ID: 5A1\n", "take `can_logger -f log.asc`"),
     "JSON": (b'{"t": 0}\n', "JSON: write the table as CSV"),
+    "NumPy array": (b"\x93NUMPY\1\0", 'graspd.load("small-session").predict(array) takes it'),
     "rostopic echo": (b"header:\n  seq: 1\n", "what `rostopic echo` shows"),
     "rostopic echo in UTF-16": ("header:\r\n".encode("utf-16"), "what `rostopic echo` shows"),
     "XML in UTF-16 without mark": ("<a>1</a>\n".encode("utf-16-le"), "of HTML or XML"),
