@@ -39,7 +39,7 @@ from graspd.drivers.base import (
     TactileReading,
     joint_name,
 )
-from graspd.drivers.recordings.kinds import SQLITE, Kind, Unpacked, is_packed, kind_of
+from graspd.drivers.recordings.kinds import SQLITE, ZSTD, Kind, Unpacked, is_packed, kind_of
 from graspd.drivers.recordings.player import ReadingsDriver
 
 TACTILE: Final = "sr_robot_msgs/msg/BiotacAll"
@@ -217,6 +217,9 @@ class _Bag:
         chosen = [each for each in everything if (each.topic, each.msgtype) in read]
         try:
             for connection, bag_ns, content in self._reader.messages(connections=chosen):
+                if content[: len(ZSTD)] == ZSTD:  # only the folder's metadata says so
+                    problem = "its messages are packed (zstd), each alone: give the bag's folder"
+                    raise RecordingError(self._path, problem)
                 message: Any = self._decode(content, connection.msgtype)
                 stamp = message.header.stamp
                 t_ns = stamp.sec * 1_000_000_000 + stamp.nanosec

@@ -93,6 +93,7 @@ _ASC_LINE: Final = re.compile(
     re.IGNORECASE | re.MULTILINE,
 )
 """The header of an ASC file, or a frame, `0.000200 1 5A1 Rx d 7 A4 CB`."""
+ZSTD: Final = b"\x28\xb5\x2f\xfd"
 SQLITE: Final = b"SQLite format 3\0"
 _SERIAL_EVENTS: Final = frozenset((1, 2, 3))
 """Types of the records of `graspd.drivers.recordings.serial_log`."""
@@ -110,7 +111,7 @@ _OTHERS: Final = {
     b"\x80": "a Python pickle: write the table as CSV or Parquet",
     b"ARROW1": "Arrow or Feather: write the table as Parquet",
     b"\xff\xff\xff\xff": "a stream of Arrow: write the table as Parquet",
-    b"\x28\xb5\x2f\xfd": "packed with zstd: unpack it first",
+    ZSTD: "packed with zstd: unpack it first",
     b"BZh": "packed with bzip2: unpack it first",
     b"\xfd7zXZ": "packed with xz: unpack it first",
     b"7z\xbc\xaf": "a 7z archive: unpack it first",

@@ -117,6 +117,18 @@ def test_a_ros_2_bags_storage_file_is_read_alone(tmp_path: Path, plugin: Storage
     assert len(readings_of(storage.rename(tmp_path / "hand.bin"))) == 30
 
 
+@pytest.mark.parametrize("plugin", StoragePlugin)
+def test_a_storage_file_of_packed_messages_names_the_folder(
+    tmp_path: Path, plugin: StoragePlugin
+) -> None:
+    folder = BagOf(2).write(
+        tmp_path / "hand", noise(3), packing=CompressionMode.MESSAGE, storage_plugin=plugin
+    )
+    (storage,) = (path for path in folder.iterdir() if path.name != "metadata.yaml")
+    with pytest.raises(RecordingError, match=r"packed \(zstd\), .* give the bag's folder"):
+        fingers_of(storage)
+
+
 @pytest.mark.parametrize(
     ("rails", "absent", "is_there"),
     [(24, range(9), True), (12, range(10, 20), False), (11, range(30), True)],
