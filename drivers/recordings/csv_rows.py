@@ -29,6 +29,7 @@ from graspd.drivers.recordings.values import (
     has_thousands,
     number_of,
     outcome_of,
+    problem_with,
     shown,
 )
 
@@ -121,7 +122,11 @@ class Recording:
                 if count is None:
                     counts[place] = self._unusual(texts[place], place, faults)
             if faults.all() and are_texts(texts):
-                raise self._cells.error("has text in place of counts: another header, or units?")
+                begin = (text.lstrip()[:1] for text in texts)
+                problem = problem_with(texts, decimal_comma=self._comma)
+                if problem is None or not any(map(str.isdigit, begin)):
+                    problem = "has text in place of counts: another header, or units?"
+                raise self._cells.error(problem)
         return np.array(counts, dtype=np.uint16).reshape(self._shape), faults
 
     def _unusual(self, text: str, place: int, faults: NDArray[np.uint8]) -> int:

@@ -101,6 +101,15 @@ BAD_FILES = {
         GOOD + GOOD.split(b"\n")[0] + b"\n",
         "line 4: has text in place of counts: another header, or units?",
     ),
+    "one row with separators of thousands": (
+        GOOD + GOOD.split(b"\n")[1].replace(b",1", b",1 ") + b"\n",
+        "line 4: 72 of 72 values are not counts, whole numbers in 0..4095, the first is '1 000': "
+        "write them without a separator of thousands",
+    ),
+    "a row of units": (
+        GOOD + b"thing,0" + b",counts" * 72 + b"\n",
+        "line 4: has text in place of counts: another header, or units?",
+    ),
     "time backwards": (
         stream(["5", "5.01", "5.0"]),
         "line 4, column t: time goes backwards, from 5.01 s to 5.0 s",
