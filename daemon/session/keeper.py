@@ -15,14 +15,10 @@ from msgspec.structs import replace
 from graspd.biotac import ELECTRODES
 from graspd.daemon.judge.exchange import Exchanged
 from graspd.daemon.judge.pipeline import Pipeline
+from graspd.daemon.judge.reasons import Reason
 from graspd.daemon.process.worker import Worker
 from graspd.daemon.publish.companion import KEPT, Answer, Reply, Requests, Told
-from graspd.daemon.session.file import (
-    KeptSession,
-    SessionFileError,
-    of_fingers,
-    restore_kept,
-)
+from graspd.daemon.session.file import KeptSession, SessionFileError, of_fingers, restore_kept
 from graspd.daemon.session.folder import KEPT_MAX, SessionFolder
 from graspd.daemon.session.sensors import (
     FIT_GRASPS,
@@ -130,6 +126,10 @@ class SessionKeeper(SensorWatch):
             log.warning(warning, why, exc_info=unexpected)
         self._warned = why
         self._answer(self._in_writing, Reply(Told.NOT_KEPT, why))
+
+    @property
+    def health(self) -> dict[str, Reason]:
+        return {"session": Reason.NOT_KEPT} if self._warned else {}
 
     def _start_save(self) -> None:
         """Start a save of the present state, unless one runs; answer at once if nothing is new."""

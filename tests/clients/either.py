@@ -26,6 +26,7 @@ class Said(NamedTuple):
     decision: str
     grasp: Grasp
     reasons: tuple[str, ...] = ()
+    owner: str | None = None
 
     @property
     def word(self) -> str:
@@ -47,7 +48,8 @@ class InPython:
         answer = self._client.may_i_lift(deadline_s, supervised=supervised, still_ms=still_ms)
         said = answer.verdict
         about = Grasp(said.boot_id or "-", -1 if said.grasp is None else said.grasp)
-        return Said(bool(answer), answer.supervised, said.decision, about, said.reasons)
+        word = said.decision, about, said.reasons, said.owner
+        return Said(bool(answer), answer.supervised, *word)
 
     def grasp(self, deadline_s: float, *, supervised: bool = False) -> int | None:
         found = self._client.wait_for_grasp(deadline_s, supervised=supervised)
@@ -78,10 +80,11 @@ class InCpp:
     ) -> Said:
         still = "-" if still_ms is None else still_ms
         words = self._ask("lift", deadline_s, int(supervised), still).split()
-        may, under_watch, decision, unreported, grasp, boot_id, *reasons = words
+        may, under_watch, decision, unreported, grasp, boot_id, owner, *reasons = words
         self.unreported = int(unreported)
         about = Grasp(boot_id, int(grasp))
-        return Said(may == "1", under_watch == "1", decision, about, tuple(reasons))
+        word = decision, about, tuple(reasons), None if owner == "-" else owner
+        return Said(may == "1", under_watch == "1", *word)
 
     def grasp(self, deadline_s: float, *, supervised: bool = False) -> int | None:
         found = int(self._ask("wait", deadline_s, int(supervised)))

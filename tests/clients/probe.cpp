@@ -71,7 +71,8 @@ void call(std::optional<graspd::Client>& client, const std::string& order,
         const auto& said = answer.verdict;
         std::cout << static_cast<bool>(answer) << ' ' << answer.supervised << ' '
                   << graspd::name(said.decision) << ' ' << client->unreported() << ' '
-                  << said.grasp.value_or(-1) << ' ' << (said.boot_id.empty() ? "-" : said.boot_id);
+                  << said.grasp.value_or(-1) << ' ' << (said.boot_id.empty() ? "-" : said.boot_id)
+                  << ' ' << (said.owner.empty() ? "-" : said.owner);
         for (const std::string& reason : said.reasons) std::cout << ' ' << reason;
     } else if (order == "wait") {
         const double deadline_s = number().value();

@@ -18,6 +18,8 @@ LONG_S, DEADLINE_S = 100.0, 0.3
 UNKNOWN, SLIP = {"outcome": "unknown"}, {"outcome": "slip"}
 WATCHED = UNKNOWN | TEACHES
 """Fields of a verdict published in the warm-up."""
+UNSAID: dict[str, Any] = {"verdict": "unknown", "verdict_code": 0, "valid": False, "p_slip": None}
+"""Fields that make a `stable` message unknown."""
 WATCHES, STILL = {"supervised": True}, {"still_ms": 240.0}
 """Arguments of `lift`: supervision by a person, stillness."""
 NO_RISK = {"target": 0.05, "lifts": 1, "slips": 0}
@@ -119,6 +121,34 @@ def test_a_refused_lift_has_its_reasons(
     with false_daemon(tmp_path, **published):
         graspd = connect(tmp_path, ask)
         wait_until(lambda: graspd.lift(DEADLINE_S, **wants).reasons == tuple(reasons))
+
+
+@pytest.mark.parametrize(
+    ("published", "change", "wants", "reasons", "owner"),
+    [
+        ({}, UNSAID | {"reasons": ["not-kept"]}, {}, ["not-kept"], None),
+        ({}, UNSAID | {"reasons": ["not-kept"], "grasp": 2}, {}, ["no-answer"], None),
+        ({}, UNSAID | {"reasons": ["not-kept"], "boot_id": "b"}, {}, ["no-answer"], None),
+        (WATCHED, {"supervised": False, "owner": "another"}, WATCHES, ["unproven"], "another"),
+    ],
+)
+def test_a_refusing_answer_gives_its_reasons_and_owner(
+    connect: Connect,
+    tmp_path: Path,
+    published: Fields,
+    change: Fields,
+    wants: Fields,
+    reasons: list[str],
+    owner: str | None,
+) -> None:
+    with false_daemon(tmp_path, told(**change), **published):
+        graspd = connect(tmp_path, "ask")
+
+        def is_told() -> bool:  # on a busy machine a message may be too old first
+            said = graspd.lift(DEADLINE_S, **wants)
+            return (said.reasons, said.owner) == (tuple(reasons), owner)
+
+        wait_until(is_told)
 
 
 def test_clients_reach_a_daemon_on_an_ipv6_address(connect: Connect, tmp_path: Path) -> None:

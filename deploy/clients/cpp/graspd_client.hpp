@@ -864,7 +864,8 @@ public:
             if (answer_) answer_ = if_still(*std::move(answer_));
             const bool permitted = answer_ && permits(*answer_);
             if (answer_ && answer_->decision == Decision::slip && !permitted) return *answer_;
-            if (!permitted) answer_.reset();
+            refusal_.reset();
+            if (!permitted) refusal_.swap(answer_);
         }
         if (answer_ && !is_behind(newest, *answer_)) {
             if (permits(newest) && newest.grasp == answer_->grasp &&
@@ -881,8 +882,7 @@ public:
             asked_ = true;
         }
         if (newest.decision == Decision::unknown && !permits(newest)) return newest;
-        return newest.unknown(newest.reasons.empty() ? std::vector<std::string>{"no-answer"}
-                                                     : newest.reasons);
+        return refused(std::move(newest));
     }
 
     // Returns the verdict, with the reason `no-answer` too if it decides nothing and the daemon
@@ -897,6 +897,18 @@ public:
     }
 
 private:
+    // Returns the newest verdict as unknown, with the reasons and the owner of the answer that
+    // refused its grasp; without one for `no-answer`.
+    Verdict refused(Verdict newest) const {
+        std::vector<std::string> why = newest.reasons;
+        if (refusal_ && key(*refusal_) == key(newest)) {
+            if (!refusal_->reasons.empty()) why = refusal_->reasons;
+            newest.owner = refusal_->owner;
+        }
+        if (why.empty()) why.emplace_back("no-answer");
+        return newest.unknown(std::move(why));
+    }
+
     // Returns the verdict, as unknown if it permits a lift but the hand was not still long enough.
     // A lift under supervision must not be early; any lift needs `still_ms` of stillness.
     Verdict if_still(Verdict said) const {
@@ -910,7 +922,8 @@ private:
     bool asks_, supervised_, asked_ = false, heard_ = false;
     bool may_be_announced_ = false, lifts_ = false;
     std::optional<double> still_ms_;
-    std::optional<Verdict> answer_;  // answer to be confirmed
+    std::optional<Verdict> answer_;   // answer to be confirmed
+    std::optional<Verdict> refusal_;  // last answer, if it permits no lift
 };
 
 }  // namespace detail

@@ -958,6 +958,8 @@ class _Question:
         self._asked = self._heard = self._may_be_announced = False
         self._answer: Verdict | None = None
         """Answer that the newest message must confirm; None: no answer yet."""
+        self._refusal: Verdict | None = None
+        """Last answer, if it permits no lift."""
 
     def permits(self, said: Verdict) -> bool:
         """Return True if a verdict lets the hand lift."""
@@ -985,7 +987,7 @@ class _Question:
                 said = self._if_still(self._newest.if_open(answer.verdict))
             if said.decision == Decision.SLIP and not self.permits(said):
                 return said
-            self._answer = said if self.permits(said) else None
+            self._answer, self._refusal = (said, None) if self.permits(said) else (None, said)
         if self._answer is not None and _reaches(newest, self._answer):
             same = (newest.grasp, newest.supervised) == (
                 self._answer.grasp,
@@ -1001,7 +1003,7 @@ class _Question:
             self._asked, self._may_be_announced = True, False
         if newest.decision == Decision.UNKNOWN and not self.permits(newest):
             return newest
-        return newest.unknown(*(newest.reasons or ("no-answer",)))
+        return self._refused(newest)
 
     def at_the_end(self, said: Verdict) -> Verdict:
         """Return the verdict, with the reason `no-answer` too if it decides nothing and the daemon
@@ -1009,6 +1011,15 @@ class _Question:
         if self._asking is None or self._heard or said.seq is None or self.is_over(said):
             return said
         return replace(said, reasons=tuple(dict.fromkeys([*said.reasons, "no-answer"])))
+
+    def _refused(self, newest: Verdict) -> Verdict:
+        """Return the newest verdict as unknown, with the reasons and the owner of the answer that
+        refused its grasp; without one for `no-answer`."""
+        refusal = self._refusal
+        if refusal is None or _key(refusal) != _key(newest):
+            return newest.unknown(*(newest.reasons or ("no-answer",)))
+        reasons = refusal.reasons or newest.reasons or ("no-answer",)
+        return replace(newest.unknown(*reasons), owner=refusal.owner)
 
     def _if_still(self, said: Verdict) -> Verdict:
         """Return the verdict, as unknown if it permits a lift but the hand was not still long

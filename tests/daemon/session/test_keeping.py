@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from graspd.daemon.judge.pipeline import Pipeline
+from graspd.daemon.judge.reasons import Reason
 from graspd.daemon.publish.companion import KEPT, Reply, Told
 from graspd.daemon.session.file import KeptSession
 from graspd.daemon.session.folder import SessionFolder
@@ -195,10 +196,11 @@ def test_a_folder_that_cannot_be_made_is_tried_again(
     where = f"{gone}/right: cannot keep the session: No such file or directory"
     assert found == [Reply(Told.NOT_KEPT, where)]
     assert caplog.text.count(where) == 1
+    assert keeper.health == {"session": Reason.NOT_KEPT}
     gone.mkdir()
     keeper.keep(found.append)
     go_round(keeper)
-    assert found[1:] == [KEPT]
+    assert (found[1:], keeper.health) == ([KEPT], {})
     assert kept_trust(folder) == part.state()
     keeper.save()
     folder.close()
