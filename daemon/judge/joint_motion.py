@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+import math
 
 from graspd.daemon.judge.reasons import Reason
 from graspd.drivers.base import JointReading
@@ -25,61 +24,51 @@ FROZEN_NS = 1_000_000_000
 The noise of a Hall sensor is one count, so even a single joint changes many times in it.
 """
 ANGLES = 16
-"""Number of readings of a set of joints that are kept per window; others are left out."""
-LOST_MAX = 64
-"""Most names of lost joints that are remembered; a hand has 24 joints."""
-SOURCES_MAX = 8
-"""Most sets of joints, such as those of one finger, that are followed; one more clears them."""
+"""Number of angles of a joint that are kept per window; others are left out."""
+JOINTS_MAX = 64
+"""Most joints that are followed, one more clears them, and most names of lost joints that are
+remembered; a hand has 24 joints."""
 
 
 class JointMotion:
-    """Follows the joints of one hand. Constant memory, no clock."""
+    """Follows the joints of one hand, however messages group them. Constant memory, no clock."""
 
     def __init__(self) -> None:
         """Start without angles; `LOST_NS` counts from the first sweep on."""
-        self.past: dict[tuple[str, ...], list[tuple[int, NDArray[np.float64]]]] = {}
-        """Times, ns, and angles, rad, shape (names,), of each set, oldest first.
-
-        A set is the tuple of names of joints that are sent together, sorted: keys of a JSON object
-        have no order.
-        """
-        self.latest_ns: dict[tuple[str, ...], int] = {}
-        """Time of the last reading of each set, ns."""
+        self.past: dict[str, list[tuple[int, float]]] = {}
+        """Times, ns, and angles, rad, of each joint, oldest first."""
+        self.latest_ns: dict[str, int] = {}
+        """Time of the last angle of each joint, ns."""
         self.lost: list[str] = []
         """Joints whose angles no longer come."""
         self._waits_since_ns: int | None = None
-        """Time since which no set is known. None: not noticed yet."""
+        """Time since which no joint is known. None: not noticed yet."""
         self._changed_ns: int | None = None
         """Time of the last change of any angle. None: no angle came yet."""
 
     def observe(self, reading: JointReading, t_ns: int) -> None:
         """Take in angles made at `t_ns`, on the same clock as the sweeps.
 
-        A joint whose angle is NaN counts as not sent. If its last one is at most `LATE_NS` old, the
-        whole message counts as not sent, so that its set is judged by the angles before and after.
+        A joint whose angle is NaN counts as not sent: it is judged by the angles before and after.
         """
-        valid = ~np.isnan(reading.position_rad)
-        if not valid.any():
-            return
-        order = sorted(np.flatnonzero(valid).tolist(), key=reading.names.__getitem__)
-        names = tuple(reading.names[place] for place in order)
-        if len(names) < valid.size and self._lacks_some(names, reading.names, t_ns):
-            return
-        if names not in self.past and len(self.past) >= SOURCES_MAX:
+        for name, angle in zip(reading.names, reading.position_rad.tolist(), strict=True):
+            if not math.isnan(angle):
+                self._take(name, angle, t_ns)
+
+    def _take(self, name: str, angle: float, t_ns: int) -> None:
+        if name not in self.past and len(self.past) >= JOINTS_MAX:
             self.past.clear()
             self.latest_ns.clear()
-        past = self.past.setdefault(names, [])
-        latest_ns = self.latest_ns.get(names, t_ns)
+        past = self.past.setdefault(name, [])
         before = past[-1][1] if past else None
-        if not 0 <= t_ns - latest_ns <= LATE_NS:
-            past.clear()  # time went back, or the joints may have moved in a gap
-        self.latest_ns[names] = t_ns
+        if not 0 <= t_ns - self.latest_ns.get(name, t_ns) <= LATE_NS:
+            past.clear()  # time went back, or the joint may have moved in a gap
+        self.latest_ns[name] = t_ns
         if not past or t_ns - past[-1][0] >= WINDOW_NS // ANGLES:
-            angles = reading.position_rad[order]
-            past.append((t_ns, angles))
+            past.append((t_ns, angle))
             del past[: -(ANGLES + 2)]  # one more at each end of the window
-            # The first angles of a set are not a change, because sets may come and go.
-            changed = before is not None and angles.tobytes() != before.tobytes()
+            # The first angle of a joint is not a change, because joints may come and go.
+            changed = before is not None and angle != before
             if changed or self._changed_ns is None or t_ns < self._changed_ns:
                 self._changed_ns = t_ns
 
@@ -100,7 +89,7 @@ class JointMotion:
         """Return True if joints are missing at `t_ns` and judging continues without them."""
         # Angles that all come that late are forgotten at each sweep, and come again.
         late = any(t_ns - at_ns > LOST_NS for at_ns in self.latest_ns.values())
-        return late or self.is_lost(t_ns) or bool(set(self.lost).difference(*self.past))
+        return late or self.is_lost(t_ns) or not self.past.keys() >= set(self.lost)
 
     @property
     def is_frozen(self) -> bool:
@@ -117,33 +106,25 @@ class JointMotion:
             and t_ns - self._waits_since_ns > LOST_NS
         )
 
-    def _lacks_some(self, names: tuple[str, ...], sent: tuple[str, ...], t_ns: int) -> bool:
-        """Return True if a set that came shortly before `t_ns` is `sent`, but with NaN for some.
-
-        `names`: the joints that have angles in the message.
-        """
-        return any(
-            0 <= t_ns - latest_ns <= LATE_NS and set(names) < set(followed) <= set(sent)
-            for followed, latest_ns in self.latest_ns.items()
-        )
-
     def _drop_lost(self, t_ns: int) -> None:
-        """Forget sets last read over `LOST_NS` before `t_ns`, or over `LATE_NS` after it."""
-        for names, latest_ns in list(self.latest_ns.items()):
+        """Forget joints last read over `LOST_NS` before `t_ns`, or over `LATE_NS` after it."""
+        for name, latest_ns in list(self.latest_ns.items()):
             if -LATE_NS <= t_ns - latest_ns <= LOST_NS:
                 continue
-            del self.past[names], self.latest_ns[names]
+            del self.past[name], self.latest_ns[name]
             self._waits_since_ns = min(latest_ns, t_ns)
-            if len(self.lost) < LOST_MAX:
-                self.lost += [name for name in names if name not in self.lost]
+            if name not in self.lost and len(self.lost) < JOINTS_MAX:
+                self.lost.append(name)
 
-    def _is_still(self, past: list[tuple[int, NDArray[np.float64]]]) -> bool:
+    def _is_still(self, past: list[tuple[int, float]]) -> bool:
         now_ns, now = past[-1]
         while len(past) > 2 and now_ns - past[1][0] >= WINDOW_NS:
             del past[0]
         if now_ns - past[0][0] < WINDOW_NS:
             return False
+        oldest_ns, oldest = past[0]
+        if abs(oldest - now) > RAD_PER_S * (now_ns - oldest_ns) / 1e9:
+            return False
         # Each angle of the window is compared with the newest: the ends alone would miss a swing.
-        moved = np.abs(np.array([then for _, then in past]) - now).max(axis=1)
-        ages_ns = [max(now_ns - at_ns, WINDOW_NS) for at_ns, _ in past]
-        return bool((moved <= RAD_PER_S * np.array(ages_ns) / 1e9).all())
+        angles, most = [angle for _, angle in past[1:]], RAD_PER_S * WINDOW_NS / 1e9
+        return max(angles) - now <= most and now - min(angles) <= most
