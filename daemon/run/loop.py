@@ -360,6 +360,10 @@ class Loop:
         if report.outcome == "not-lifted" and lifts.take_back(grasp):
             self._keep(answer)
             return
+        if report.outcome == "not-lifted" and lifts.is_told(grasp):
+            lifts.told[OutcomeStatus.CONTRADICTS] += 1
+            answer(REFUSALS[OutcomeStatus.CONTRADICTS])
+            return
         status = self._pipeline.outcome(grasp, slipped=report.outcome == "slip")
         if status in REFUSALS:
             is_earlier = status is OutcomeStatus.UNKNOWN and grasp.boot_id != self._outbox.boot_id

@@ -217,7 +217,7 @@ def test_a_companion_asks_reports_outcomes_and_gets_the_answers() -> None:
 BOOT = "b" * 32
 
 
-def told(bench: LoopBench, outcome: Literal["stable", "slip"]) -> list[Reply]:
+def told(bench: LoopBench, outcome: Literal["stable", "slip", "not-lifted"]) -> list[Reply]:
     """Report an outcome of the first grasp; return a list to which its answers are added."""
     answers: list[Reply] = []
     bench.loop.outcome(Report(GraspId(BOOT, 1), outcome), answers.append)
@@ -240,6 +240,18 @@ def test_outcomes_are_answered_once_saved_and_then_as_repeated() -> None:
     assert told(bench, "slip") == [Reply(Told.REPEATED)]
     assert len(waiting) == 3
     assert [topic for topic, _ in bench.output.sent].count(b"outcome.right") == 1
+
+
+@pytest.mark.parametrize("outcome", ["stable", "slip"])
+def test_not_lifted_after_an_outcome_is_refused_as_contradicting(
+    outcome: Literal["stable", "slip"],
+) -> None:
+    clock = Clock()
+    bench = LoopBench(FakeDriver([reading(clock())], clock), clock, boot_id=BOOT)
+    bench.run()
+    assert told(bench, outcome) == [KEPT]
+    assert [reply.told for reply in told(bench, "not-lifted")] == [Told.CONTRADICTS]
+    assert bench.pipeline.lifts.told[OutcomeStatus.CONTRADICTS] == 1
 
 
 def test_a_replay_takes_outcomes_that_name_its_own_start() -> None:
