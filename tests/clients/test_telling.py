@@ -18,6 +18,7 @@ from tests.clients.false_daemon import TAKEN, false_daemon
 from tests.clients.messages import TEACHES, verdict
 from tests.clients.test_both import DEADLINE_S, LONG_S
 from tests.conftest import ROOT
+from tests.kit.programs import ran
 from tests.kit.waiting import wait_until
 
 PYTHON = ROOT / "deploy" / "clients" / "python"
@@ -121,6 +122,19 @@ def test_lifts_without_an_outcome_are_counted_and_warned_of(
     assert caplog.messages + graspd.warned == [
         f"{number} lifts were allowed, and their outcome not told" for number in (1, 11)
     ]
+
+
+@pytest.mark.parametrize(
+    ("typed", "told"), [("held", "stable"), ("mist\nslipped", "slip"), ("", "not-lifted")]
+)
+def test_lift_gate_tells_its_lift_whatever_is_typed(
+    lift_gate: Path, tmp_path: Path, typed: str, told: str
+) -> None:
+    with false_daemon(tmp_path) as heard:
+        words = f"ipc://{tmp_path}/out", LONG_S, f"ipc://{tmp_path}/ask", "mug"
+        result = ran(lift_gate, *words, typed=typed)
+    assert (result.returncode, result.stdout[-6:]) == (0, "taken\n")
+    assert heard[-1].split()[2:] == [b"1", told.encode(), b"mug"]
 
 
 def test_the_example_controller_reports_a_supervised_unknown_grasp(tmp_path: Path) -> None:

@@ -5,7 +5,9 @@
 //                                                     one question; a person watches the lift; the
 //                                                     hand must have been still for MS. With
 //                                                     OBJECT: after a yes reads held, slipped or
-//                                                     not-lifted, and tells it
+//                                                     not-lifted, and tells it; not-lifted at the
+//                                                     end of the input. Without it the lift stays
+//                                                     announced, and cannot be told
 //     lift_gate --tell ENDPOINT ASK_ENDPOINT BOOT_ID GRASP held|slipped [OBJECT]
 //                                                     shows the answer to a client that never got a
 //                                                     yes: `not yours`. A controller tells by the
@@ -47,6 +49,18 @@ int show(const graspd::OutcomeAnswer& answer) {
     return answer ? 0 : 1;
 }
 
+// Reads how the lift ended, until it is an outcome; at the end of the input no lift followed.
+graspd::Outcome typed() {
+    for (std::string word; std::cin >> word;) {
+        try {
+            return outcome(word);
+        } catch (const std::invalid_argument& error) {
+            std::cerr << error.what() << "?\n";
+        }
+    }
+    return graspd::Outcome::not_lifted;
+}
+
 int ask(const graspd::Options& options, double deadline_s, bool supervised,
         std::optional<double> still_ms, const std::optional<std::string>& object) {
     graspd::Client client(options);
@@ -55,9 +69,8 @@ int ask(const graspd::Options& options, double deadline_s, bool supervised,
     std::cout << (answer ? "lift" : "do not lift") << (answer.supervised ? " supervised" : "")
               << " after " << answer.waited_s << " s"
               << (answer.verdict.owner.empty() ? "" : ", owner: " + answer.verdict.owner) << std::endl;
-    std::string word;
-    if (!answer || !object || !(std::cin >> word)) return answer ? 0 : 1;
-    return show(client.tell(answer.verdict, outcome(word), *object));
+    if (!answer || !object) return answer ? 0 : 1;
+    return show(client.tell(answer.verdict, typed(), *object));
 }
 
 int tell(const std::vector<std::string>& words) {
