@@ -209,7 +209,8 @@ def test_a_ros_feeder_sends_its_topics_counts_and_angles(
 class Node:
     """The part of `rclpy.node.Node` that the example uses."""
 
-    endpoints: dict[str, str]
+    given: dict[str, str]
+    """Parameters that the node was given."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -218,8 +219,7 @@ class Node:
         self.served: dict[str, Callable[[Any, Any], Any]] = {}
 
     def declare_parameter(self, name: str, value: str) -> SimpleNamespace:
-        assert value.startswith("ipc:///run/graspd/")
-        return SimpleNamespace(value=self.endpoints[name])
+        return SimpleNamespace(value=self.given.get(name, value))
 
     def create_publisher(self, _kind: type, topic: str, depth: int) -> SimpleNamespace:
         assert depth == 1, "what is old is not to be delivered"
@@ -247,8 +247,8 @@ class Service:
     Request = Response = SimpleNamespace
 
 
-@pytest.fixture
-def node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Node:
+def made_node(monkeypatch: pytest.MonkeyPatch, given: dict[str, str], **client: object) -> Node:
+    """Make the example's node with the parameters `given`; `client`: stand-ins of its names."""
     stand_in(
         monkeypatch,
         {
@@ -258,12 +258,38 @@ def node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Node:
             "std_msgs.msg": {"String": String},
             "std_srvs": {},
             "std_srvs.srv": {"SetBool": Service, "Trigger": Service},
-            "graspd_client": vars(graspd_client),
+            "graspd_client": vars(graspd_client) | client,
         },
     )
-    Node.endpoints = {"endpoint": f"ipc://{tmp_path}/out", "ask_endpoint": f"ipc://{tmp_path}/ask"}
+    Node.given = given
     made: Node = runpy.run_path(str(NODE))["GraspNode"]()
     return made
+
+
+@pytest.fixture
+def node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Node:
+    endpoints = {"endpoint": f"ipc://{tmp_path}/out", "ask_endpoint": f"ipc://{tmp_path}/ask"}
+    return made_node(monkeypatch, endpoints)
+
+
+@pytest.mark.parametrize(
+    ("given", "hand", "endpoint"),
+    [
+        ({}, "right", "ipc:///run/graspd/right.ipc"),
+        ({"hand": "left"}, "left", "ipc:///run/graspd/left.ipc"),
+        ({"hand": "left", "endpoint": "ipc:///tmp/l"}, "left", "ipc:///tmp/l"),
+    ],
+)
+def test_the_ros2_node_serves_the_hand_that_it_is_given(
+    monkeypatch: pytest.MonkeyPatch, given: dict[str, str], hand: str, endpoint: str
+) -> None:
+    found: list[object] = []
+
+    def client(endpoint: str, hand: str, *, ask_endpoint: str) -> None:
+        found.extend([endpoint, hand, ask_endpoint])
+
+    made_node(monkeypatch, given, Client=client)
+    assert found == [endpoint, hand, f"ipc:///run/graspd/{hand}.ask.ipc"]
 
 
 def test_the_ros2_node_publishes_decisions_answers_and_reports_outcomes(
@@ -279,8 +305,11 @@ def test_the_ros2_node_publishes_decisions_answers_and_reports_outcomes(
 
     publish()
     assert decisions == ["unknown no-message"]
-    with false_daemon(tmp_path):
+    with false_daemon(tmp_path) as heard:
         wait_until(is_stable)
+        wait_until(lambda: node.ask("~/may_i_lift") == (True, "stable"))
+        wait_until(lambda: node.ask("~/not_lifted") == (True, ""))
+        assert heard[-1].endswith(b" 1 not-lifted")
         wait_until(lambda: node.ask("~/may_i_lift") == (True, "stable"))
         wait_until(lambda: node.ask("~/held", data=True) == (True, ""))
         assert node.ask("~/may_i_lift") == (False, "unknown outcome-told")
