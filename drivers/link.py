@@ -36,6 +36,8 @@ DRIFT: Final = 1000
 """Clocks of two computers drift apart by less than one part in this; NTP slews by half that."""
 READABLE: Final = 1
 """POLLIN of poll(2), which Python lacks on some systems."""
+BROKEN: Final = 0
+"""No event of poll(2): only an error or a hang-up makes the descriptor ready."""
 
 _log = logging.getLogger(__name__)
 

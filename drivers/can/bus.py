@@ -34,7 +34,7 @@ from graspd.drivers.can.frames import (
 )
 from graspd.drivers.can.interfaces import OWN_OPTIONS, Options, open_bus, refuse_unusable
 from graspd.drivers.kernel_stamps import ANCILLARY_BYTES, SO_RXQ_OVFL, read_stamps
-from graspd.drivers.link import SenderClock, is_ready
+from graspd.drivers.link import BROKEN, SenderClock, is_ready
 
 FRAMES_PER_DRAIN: Final = 512
 """Most frames of one `drain`: about 100 ms of a full bus. The loop must get its turn."""
@@ -181,6 +181,10 @@ class CanBus:
                     self._idle_ns = before_ns
                     if self._is_remote:
                         self._notice_quiet(before_ns, bool(frames))
+                    return
+                # seeedstudio returns no frame after a hang-up either.
+                if is_ready(self.descriptor, BROKEN):
+                    self.failure = LinkError(LinkCause.DISCONNECTED, "the adapter was unplugged")
                     return
                 continue
             frame = _frame_of(message)

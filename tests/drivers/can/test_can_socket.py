@@ -7,7 +7,8 @@ import pty
 import socket
 import time
 import tty
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -27,6 +28,7 @@ from tests.drivers.can.can_standin import (
 from tests.drivers.can.can_words import pack_frame
 from tests.drivers.one_sweep import counts_of, sweeps_of, tactile
 from tests.kit.clock import Clock
+from tests.kit.waiting import wait_until
 
 MS = 1_000_000
 
@@ -209,3 +211,51 @@ def test_a_frame_behind_an_slcan_adapters_answer_is_read(
     assert max(slept_s) < 1.5, "python-can's default sleeps two seconds"
     os.close(near)
     os.close(far)
+
+
+ADAPTERS: dict[str, Callable[[CanFrame], bytes]] = {
+    "slcan": lambda frame: b"t%03X7%s\r" % (SAMPLE_ID, frame.data.hex().encode()),
+    "serial": lambda frame: (
+        b"\xaa\0\0\0\0\7" + SAMPLE_ID.to_bytes(4, "little") + frame.data + b"\xbb"
+    ),
+    "seeedstudio": lambda frame: (
+        b"\xaa\xc7" + SAMPLE_ID.to_bytes(2, "little") + frame.data + b"\x55"
+    ),
+}
+"""By interface: a frame as its adapter sends it (python-can's and Seeed Studio's documents)."""
+
+
+def plug(path: Path) -> tuple[int, int]:
+    """Link `path` to a terminal; return its two ends, the adapter's first."""
+    near, far = pty.openpty()
+    tty.setraw(far)
+    path.symlink_to(os.ttyname(far))
+    return near, far
+
+
+def from_adapter(interface: str, path: Path, clock: Clock) -> CanBridgeDriver:
+    """By a clock that stands still: a stalled machine would drop frames without stamps."""
+    options: dict[str, Any] = {"arbitration_id": SAMPLE_ID, "sequence": "electrodes"}
+    return CanBridgeDriver(interface, str(path), clock=clock, **options)
+
+
+@pytest.mark.parametrize("interface", ADAPTERS)
+def test_an_unplugged_adapter_is_opened_again(interface: str, tmp_path: Path) -> None:
+    path, clock = tmp_path / "adapter", Clock()
+    ends = plug(path)
+    with from_adapter(interface, path, clock) as driver:
+        os.write(ends[0], ADAPTERS[interface](sweep_of_frames(0)[0]))
+        wait_until(lambda: driver.read_ready() or driver.counters.frames)
+        for end in ends:
+            os.close(end)
+        path.unlink()
+        driver.read_ready()
+        assert driver.stream.link.state is LinkState.WAITING
+        ends = plug(path)
+        clock.now_ns = driver.due_ns() or 0
+        assert driver.read_ready() == []
+        os.write(ends[0], b"".join(map(ADAPTERS[interface], sweep_of_frames(1))))
+        wait_until(driver.read_ready)
+        assert (driver.counters.faulty_readings, driver.counters.bus_faults) == (0, 1)
+    for end in ends:
+        os.close(end)
