@@ -47,6 +47,8 @@ QUIET_NS: Final = 2_000_000_000
 not notice a lost server."""
 STAMPED_INTERFACES: Final = frozenset({"socketcan", "udp_multicast", "virtual"})
 """Interfaces of python-can whose stamps are the wall time of arrival on this computer."""
+WAITING_INTERFACES: Final = frozenset({"seeedstudio", "serial"})
+"""Interfaces of python-can whose `recv` waits, whatever its timeout, and keeps no bytes."""
 
 
 class CanBus:
@@ -79,6 +81,7 @@ class CanBus:
             self._options["bitrate"] = bitrate
         self._stamped = interface in STAMPED_INTERFACES
         self._is_remote = interface == "socketcand"
+        self._waits = interface in WAITING_INTERFACES
         self._clock = clock
         self._wall_clock = wall_clock
         self._bus: can.BusABC | None = None
@@ -174,10 +177,11 @@ class CanBus:
         ahead_ns = now_ns - self._wall_clock()
         for _ in range(FRAMES_PER_DRAIN):
             before_ns = self._clock()
-            message = bus.recv(timeout=0)
+            would_wait = self._waits and self._is_empty()
+            message = None if would_wait else bus.recv(timeout=0)
             if message is None:
                 # slcan returns no frame for an adapter's answer, although frames wait behind it.
-                if self.descriptor is None or not is_ready(self.descriptor):
+                if self.descriptor is None or self._is_empty():
                     self._idle_ns = before_ns
                     if self._is_remote:
                         self._notice_quiet(before_ns, bool(frames))
@@ -195,6 +199,10 @@ class CanBus:
                 frames.append((frame, t_ns, t_ns))
             else:
                 frames.append((frame, *self._arrived(message.timestamp, since_ns)))
+
+    def _is_empty(self) -> bool:
+        """Return True if the descriptor, if there is one, has nothing to read."""
+        return self.descriptor is not None and not is_ready(self.descriptor)
 
     def _in_order(self, stamp_ns: int, now_ns: int) -> int:
         """Return `stamp_ns`, limited to the range from the last frame's time to now. The clocks

@@ -34,6 +34,9 @@ CONNECT_S: Final = 0.25
 OWN_OPTIONS: Final[dict[str, dict[str, str | int | float | bool]]] = {
     # By default slcan waits for 2 s after opening and for 1 ms in every read.
     "slcan": {"sleep_after_open": 0.0, "timeout": 0.0},
+    # Both fail if the rest of a frame takes longer, s. These are their defaults.
+    "seeedstudio": {"timeout": 0.1},
+    "serial": {"timeout": 0.1},
     # Without this option the server may hold frames back for 40 ms, until an acknowledgement.
     "socketcand": {"tcp_tune": True},
     # The default queue is unbounded. This one holds about 4 s of a full bus.

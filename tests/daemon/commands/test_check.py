@@ -53,6 +53,7 @@ def test_check_finds_what_run_refuses(section: str, says: str, tmp_path: Path) -
             "options.self: python-can's interface 'v",
         ),
         ('interface = "slcan"\noptions = { timeout = 1.0 }', "options.timeout: must be 0.0"),
+        ('interface = "serial"\noptions = { timeout = 0.0 }', "options.timeout: must be 0.1"),
         (
             'interface = "slcan"\nbitrate = 123456',
             "bitrate: python-can's interface 'slcan' has",

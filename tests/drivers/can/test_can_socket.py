@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pty
 import socket
+import threading
 import time
 import tty
 from collections.abc import Callable, Iterator
@@ -259,3 +260,35 @@ def test_an_unplugged_adapter_is_opened_again(interface: str, tmp_path: Path) ->
         assert (driver.counters.faulty_readings, driver.counters.bus_faults) == (0, 1)
     for end in ends:
         os.close(end)
+
+
+@pytest.mark.parametrize("interface", ADAPTERS)
+def test_a_silent_adapter_is_read_without_waiting(interface: str, tmp_path: Path) -> None:
+    path = tmp_path / "adapter"
+    ends = plug(path)
+    with from_adapter(interface, path, Clock()) as driver:
+        waited_s = []
+        for _ in range(5):
+            before_s = time.monotonic()
+            assert driver.read_ready() == []
+            waited_s.append(time.monotonic() - before_s)
+        assert min(waited_s) < 0.05, "python-can's default waits 0.1 s"
+    for end in ends:
+        os.close(end)
+
+
+@pytest.mark.parametrize("interface", ADAPTERS)
+def test_a_frame_in_two_pieces_is_read_whole(interface: str, tmp_path: Path) -> None:
+    path = tmp_path / "adapter"
+    near, far = plug(path)
+    sent = ADAPTERS[interface](sweep_of_frames(0)[0])
+    with from_adapter(interface, path, Clock()) as driver:
+        for number, cut in enumerate(range(1, len(sent)), 1):
+            rest = threading.Timer(0.002, os.write, (near, sent[cut:]))
+            os.write(near, sent[:cut])
+            rest.start()
+            wait_until(lambda: driver.read_ready() or driver.counters.frames == number)  # noqa: B023
+            rest.join()
+        assert driver.counters.bus_faults == 0
+    os.close(near)
+    os.close(far)
