@@ -99,7 +99,7 @@ def read_log(path: Path) -> Iterator[Line]:
 
 def _lines(stream: BinaryIO) -> Iterator[str]:
     """Yield lines of text in any encoding; a line that is too long comes in pieces."""
-    encoding = encoding_of(stream.read(HEAD_BYTES)) or "latin-1"
+    encoding = encoding_of(stream.read(HEAD_BYTES)) or "utf-8"
     stream.seek(0)
     with io.TextIOWrapper(stream, encoding, errors="replace") as text:
         while line := text.readline(LINE_LENGTH_MAX):

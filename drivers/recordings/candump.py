@@ -1,6 +1,7 @@
 """Lines of candump, as it writes them to a file (`-L`, `-l`) or shows them on a terminal.
 
 In a file: `(1436509052.249713) can0 100#0D3A1F`: seconds, bus, id of three or eight digits, data.
+graspd writes the scene's channel as the bus, so it may be a path (PATH_MAX of linux/limits.h).
 On a terminal: ` (1436509052.249713)  can0  100   [3]  0D 3A 1F   '.:.'`. The time has any number
 of decimals. It counts from 1970 with `-ta` and `-tA`, from the first frame with `-tz`, and from the
 frame before with `-td`. A remote frame has `R` or `remote request` instead of data, a frame of
@@ -31,7 +32,7 @@ NS_PER_S: Final = 1_000_000_000
 _LINE: Final = re.compile(
     r"""\s*
     \((?P<date>\d{4}-\d\d-\d\d\ \d\d:\d\d:)?(?P<seconds>\d{1,11})(?:\.(?P<decimals>\d{1,18}))?\)
-    \s+(?P<bus>\S{1,64})\s+
+    \s+(?P<bus>\S{1,4096}+)\s+
     (?:
         (?P<id>[0-9A-F]{3}|[0-9A-F]{8})\#
         (?:(?P<data>(?:[0-9A-F]{2}){0,8})|(?P<remote>R[0-9A-F]?)|(?P<fd>\#[0-9A-F]+))

@@ -81,7 +81,8 @@ _MARKS: Final = {
 _SPACE: Final = rb"(?:[ \t]|\x1b\[[0-9;]*m)"
 """A blank, or the code of a colour."""
 _CANDUMP_LINE: Final = re.compile(
-    rb"^" + _SPACE + rb"*+(?:\([^)\r\n]{1,40}\)" + _SPACE + rb"*+)?[!-~]{1,64}" + _SPACE + rb"++"
+    rb"^" + _SPACE + rb"*+(?:\([^)\r\n]{1,40}\)" + _SPACE + rb"*+)?"
+    rb"[!-~\x80-\xff]{1,4096}+" + _SPACE + rb"++"
     rb"(?:(?:[0-9A-F]{3}|[0-9A-F]{8})#[0-9A-FR#_. \t]*+T?[ \t]*+"
     rb"|(?:[RT]X [-B] [-E][ \t]+)?[0-9A-F]{1,8}[ \t]+\[ ?[0-9]{1,2}\].*)\r?$",
     re.IGNORECASE | re.MULTILINE,

@@ -13,7 +13,7 @@ import pytest
 from graspd.drivers.base import RecordingError, TactileReading
 from graspd.drivers.biotac import sample_command
 from graspd.drivers.can.frames import CanFrame
-from graspd.drivers.recordings.can_log import CanLog, Survey, line_of
+from graspd.drivers.recordings.can_log import CanLog, Survey, bus_name, encode_frames, line_of
 from tests.drivers.one_sweep import tactile
 
 SAMPLE_ID = 0x5A1
@@ -141,6 +141,26 @@ def test_the_channel_of_a_scene_chooses_the_bus(
     readings, _ = played([path], "can0")
     assert len(readings) == 4
     assert f"{path}: line 97 has the channel can1, too" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "channel",
+    [
+        "/dev/serial/by-id/usb-Protofusion_Labs_CANable_1205aa6_https:__github.com_normaldotcom_"
+        "cantact-fw_001C000F4E50430120303838-if00",
+        "/dev/gr\u00fcne Hand",
+    ],
+)
+def test_a_log_of_a_live_link_plays_whatever_its_channel(
+    tmp_path: Path, channel: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    frames = [(CanFrame(SAMPLE_ID, data), at * STEP_NS) for at, data in enumerate(SAMPLES * 4)]
+    stamped = [(frame, t_ns, t_ns) for frame, t_ns in frames]
+    path = tmp_path / "hand.can.log"
+    path.write_bytes(encode_frames(stamped, 10**18, bus_name(channel)))
+    readings, _ = played([path], channel)
+    assert len(readings) == 4
+    assert not caplog.text
 
 
 def test_lines_that_are_not_understood_are_counted(
