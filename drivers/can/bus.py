@@ -45,6 +45,9 @@ DATAGRAM_BYTES_MAX: Final = 4096
 QUIET_NS: Final = 2_000_000_000
 """Longest silence of a socketcand server, ns; after it the bus is reopened, because python-can does
 not notice a lost server."""
+UNFRAMED_BYTES_MAX: Final = 1024
+"""Most bytes without a frame, after which the bus is reopened: they are not frames, and slcan and
+robotell keep them all. The longest frame has 139, of CAN FD."""
 STAMPED_INTERFACES: Final = frozenset({"socketcan", "udp_multicast", "virtual"})
 """Interfaces of python-can whose stamps are the wall time of arrival on this computer."""
 WAITING_INTERFACES: Final = frozenset({"seeedstudio", "serial"})
@@ -95,6 +98,7 @@ class CanBus:
         self._idle_ns = self._received_ns = self._clock()
         self._server, self._stamp_s = SenderClock(), 0.0
         self._newest_ns: int | None = None
+        self._unframed_bytes = 0
         self._bus = bus = open_bus(self._interface, self._channel, **self._options)
         self.descriptor = _fileno(bus)
         if self.descriptor is not None:
@@ -132,7 +136,11 @@ class CanBus:
             if self._socket is not None:
                 self._drain_socket(self._socket, frames)
             elif self._bus is not None:
+                self._unframed_bytes += _waiting_bytes(self._bus)
                 self._drain_bus(self._bus, frames)
+                if self._unframed_bytes > UNFRAMED_BYTES_MAX:
+                    text = "bytes come, but no CAN frame: another device, or another baud rate"
+                    self.failure = LinkError(LinkCause.UNKNOWN, text)
         except BlockingIOError:
             pass
         except Exception as error:  # noqa: BLE001 (python-can lets any exception through)
@@ -191,6 +199,7 @@ class CanBus:
                     self.failure = LinkError(LinkCause.DISCONNECTED, "the adapter was unplugged")
                     return
                 continue
+            self._unframed_bytes = 0
             frame = _frame_of(message)
             if frame is None:
                 self.counters.malformed_frames += 1
@@ -246,6 +255,14 @@ def _fileno(bus: can.BusABC) -> int | None:
     except Exception:  # noqa: BLE001 (python-can lets any exception through)
         return None
     return descriptor if descriptor >= 0 else None
+
+
+def _waiting_bytes(bus: can.BusABC) -> int:
+    """Return how many bytes wait in the port of an slcan or robotell adapter; 0 for others."""
+    port = getattr(bus, "serialPortOrig", None)
+    with contextlib.suppress(OSError):
+        return 0 if port is None else port.in_waiting
+    return 0
 
 
 def _unpack_datagram(data: bytes) -> CanFrame | None:

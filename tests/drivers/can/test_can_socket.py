@@ -292,3 +292,21 @@ def test_a_frame_in_two_pieces_is_read_whole(interface: str, tmp_path: Path) -> 
         assert driver.counters.bus_faults == 0
     os.close(near)
     os.close(far)
+
+
+@pytest.mark.parametrize(
+    "text", [b"rcv 100 A2A251A8C894B9 E\n", bytes(32), b"$GPGGA,123519,4807.038,N\r\n"]
+)
+def test_bytes_without_a_can_frame_fail_after_a_kilobyte(text: bytes, tmp_path: Path) -> None:
+    path, sent = tmp_path / "adapter", ADAPTERS["slcan"](sweep_of_frames(0)[0])
+    near, far = plug(path)
+    with from_adapter("slcan", path, Clock()) as driver:
+        for frames in range(1, 60):
+            os.write(near, 20 * b"z\r" + sent)
+            wait_until(lambda: driver.read_ready() or driver.counters.frames == frames)  # noqa: B023
+        wait_until(
+            lambda: os.write(near, text) and (driver.read_ready() or driver.stream.last_error)
+        )
+        assert "no CAN frame" in str(driver.stream.last_error)
+    os.close(near)
+    os.close(far)
