@@ -21,7 +21,12 @@ from graspd.daemon.commands.arguments import within
 from graspd.daemon.doctor import computer
 from graspd.daemon.doctor.electrodes import FAULTY_FRACTION, ElectrodeStatistics
 from graspd.daemon.doctor.finding import Cause, Finding, Level, fine, roots
-from graspd.daemon.doctor.link import counter_findings, device_findings, rate_finding
+from graspd.daemon.doctor.link import (
+    counter_findings,
+    device_findings,
+    rate_finding,
+    two_boards_finding,
+)
 from graspd.daemon.doctor.surroundings import (
     can_finding,
     explained,
@@ -120,6 +125,9 @@ def examine(
     told = device_findings(driver.name, device, counters)
     readings = None if statistics is None else statistics.readings
     if "link" not in device or device["link"].fault is None:
+        crowd = two_boards_finding(driver.name, readings or 0, seconds, counters)
+        if crowd is not None:
+            return roots([*told, crowd])  # all else follows from it
         causes = {finding.cause for finding in told}
         more = counter_findings(driver.name, counters)
         told += [finding for finding in more if finding.cause not in causes]

@@ -10,6 +10,8 @@ from graspd.drivers.base import DeviceFault, Fact, LinkCause
 
 RATE_FRACTION = 0.9
 """Share of the nominal rate below which the link is slow."""
+BOARD_HZ_MAX = 600
+"""Readings/s of a CAN board are fewer: 24 frames of 71 bits, of one sensor, at 1 Mbit/s."""
 TOO_MUCH = {Cause.DAMAGED: 0.05, Cause.FRAMES_LOST: 0.1}
 """Share of frames from which on damage or loss is an error. Each loss hides motion for 240 ms, so
 with a tenth of 100 readings/s lost, hardly any grasp is ever known to be still."""
@@ -257,6 +259,21 @@ def rate_finding(driver: str, readings: int, seconds: float, period_ns: int | No
         advice = "Nothing was lost. The board is slow, or this computer is busy (top)."
         return Finding(Level.WARNING, what, Cause.SLOW, advice)
     return fine(what)
+
+
+def two_boards_finding(
+    driver: str, readings: int, seconds: float, counters: Mapping[str, int]
+) -> Finding | None:
+    """Return a finding if two CAN boards send with one arbitration id; None: nothing shows it.
+
+    Each frame of one then seems to begin another sweep, which most samples never join.
+    """
+    lost = counters.get("lost_frames", 0)
+    if readings < BOARD_HZ_MAX * seconds or lost <= counters.get("accepted_frames", lost):
+        return None
+    what = f"{driver}: {readings / seconds:.0f} pieces of readings/s, more than a board can send"
+    advice = "Two boards send with one arbitration id. Give each its own id or bus."
+    return Finding(Level.ERROR, what, Cause.FOREIGN_SENDER, advice)
 
 
 def _not_ours(fault: LinkCause | DeviceFault, counters: Mapping[str, int]) -> Cause | None:

@@ -17,6 +17,7 @@ from graspd.daemon.doctor.finding import Cause, Finding, Level, roots
 from graspd.daemon.doctor.link import counter_findings, device_findings, rate_finding
 from graspd.drivers.base import TactileReading
 from graspd.drivers.biotac import SEQUENCES
+from graspd.drivers.can.driver import CanBridgeDriver
 from graspd.drivers.can.frames import ERROR, CanFrame
 from graspd.drivers.can.stream import READINGS_MIN, CanStream
 from graspd.drivers.datagrams.tactile import TactileStreamDriver
@@ -168,6 +169,42 @@ def test_a_slow_or_lossy_board_has_the_sequence_it_has(
     counters = stream.counters.as_dict()
     told = device_findings("can", stream.describe()) + counter_findings("can", counters)
     assert {finding.cause for finding in told} - {None} == {Cause.FRAMES_LOST}
+
+
+@pytest.mark.parametrize("sequence", ["electrodes", "interleaved"])
+@pytest.mark.parametrize(
+    ("boards", "loss", "cause"),
+    [
+        *(((0, delay_ns), 0.0, Cause.FOREIGN_SENDER) for delay_ns in (1000, 3_300_000, 5_000_000)),
+        *(((0,), loss, Cause.FRAMES_LOST) for loss in (0.6, 0.9)),
+    ],
+)
+def test_two_can_boards_of_one_id_are_told_from_loss(
+    boards: Sequence[int], loss: float, cause: Cause, sequence: str
+) -> None:
+    """`boards`: when each begins, ns."""
+    sent, random = list[tuple[int, CanFrame]](), np.random.default_rng(0)
+    for start_ns in boards:
+        hand = Hand(100.0)
+        hand.skip(len(sent))
+        twin = CanTwin("virtual", "bus", iter(hand), sequence=sequence)
+        for sweep in range(200):
+            frames = twin.next_frames()
+            for place, frame in enumerate(frames):
+                t_ns = start_ns + 10_000_000 * sweep + 10_000_000 * place // len(frames)
+                sent.append((t_ns, CanFrame(*frame)))
+    driver = CanBridgeDriver("virtual", "bus", sequence=sequence)
+    statistics = ElectrodeStatistics(FINGERS)
+    driver.stream.link.greeting()
+    for t_ns, can_frame in sorted(sent, key=lambda each: each[0]):
+        if random.random() < loss:
+            continue
+        for reading in driver.stream.receive([(can_frame, t_ns, t_ns)])[0]:
+            assert isinstance(reading, TactileReading)
+            statistics.add(reading)
+        driver.stream.watch(t_ns)
+    (finding,) = faults_told(driver, statistics, 2.0)
+    assert (finding.level, finding.cause) == (Level.ERROR, cause)
 
 
 @pytest.mark.parametrize("every_ms", [8, 16])
