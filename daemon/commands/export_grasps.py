@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import io
 import re
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,12 +13,15 @@ from graspd.daemon.commands.arguments import UsageError
 from graspd.daemon.process.files import write_atomically
 from graspd.daemon.process.text import complain, write_lines
 from graspd.daemon.publish.messages import OBJECT_PATTERN
+from graspd.drivers.recordings.kinds import STANDARD_INPUT, files_of
 from graspd.extras import needs
 
 if TYPE_CHECKING:
     from graspd.daemon.record.export import Export
 
 FAILED = 1
+STANDARD_OUTPUT = STANDARD_INPUT
+"""Name of standard output on a command line."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -27,10 +31,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         type=Path,
         metavar="RECORDING",
-        help="what `graspd run` with [record] has written (MCAP), in the order of time",
+        help="what `graspd run` with [record] has written (MCAP), in the order of time; - is "
+        "standard input",
     )
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="TABLE", help="grasp table (CSV) to write"
+        "--out",
+        type=Path,
+        required=True,
+        metavar="TABLE",
+        help="grasp table (CSV) to write; - is standard output",
     )
     parser.add_argument(
         "--parquet",
@@ -49,15 +58,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write the table; return 1 if it cannot be written or no grasp has an outcome, else 0."""
-    if args.out.exists() and not args.force:
+    to_stdout = args.out == STANDARD_OUTPUT
+    if to_stdout and args.parquet:
+        raise UsageError("--parquet needs a file for --out; to - goes CSV")
+    if not to_stdout and args.out.exists() and not args.force:
         raise UsageError(f"{args.out} is there already: --force replaces it")
     from graspd.daemon.record.export import collect, write
 
-    export = collect(args.recordings)
-    write_lines(_summary(export))
+    with files_of(args.recordings) as files:
+        export = collect(files)
+    (complain if to_stdout else write_lines)(_summary(export))
     if not export.grasps:
         complain(f"no judged grasp with an outcome: nothing is written: {_why(export)}")
         return FAILED
+    if to_stdout:
+        write(sys.stdout, export, args.object)
+        return 0
     try:
         if args.parquet:
             from graspd.daemon.record.frames import grasps_of

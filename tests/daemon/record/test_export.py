@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -214,6 +215,20 @@ def test_the_library_reads_the_grasps_that_are_exported(tmp_path: Path) -> None:
         assert table["slipped"].tolist() == expected.slipped.tolist() == [False, True, False]
         assert table["object"].tolist() == ["mug"] * 3
         assert np.array_equal(table.iloc[:, 2:], expected.counts.reshape(3, -1))
+
+
+def test_standard_streams_serve_as_recording_and_as_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record(tmp_path / "a.mcap", (sweeps(1)[0], "slip", "mug"))
+    output("export-grasps", tmp_path / "a.mcap", "--out", tmp_path / "t.csv")
+    piped = io.TextIOWrapper(io.BytesIO((tmp_path / "a.mcap").read_bytes()))
+    monkeypatch.setattr("sys.stdin", piped)
+    monkeypatch.chdir(tmp_path)
+    done = graspd("export-grasps", "-", "--out", "-")
+    assert (done.returncode, done.stdout) == (0, (tmp_path / "t.csv").read_text())
+    assert done.stderr == "graspd: 1 grasps, 1 slipped; 1 objects by name\n"
+    assert not Path("-").exists()
 
 
 @pytest.mark.parametrize("name", ["=HYPERLINK(0)", "mug\n=1"])
