@@ -52,7 +52,7 @@ def _list(args: argparse.Namespace) -> int:
     own: dict[str, str] = {}
     clients: dict[str, str] = {}
     problems = []
-    for path in sorted(args.dir.glob(f"*{keys.SECRET}")):
+    for path in _secret_keys(args.dir):
         try:
             own[path.stem] = keys.load_own(path)[0].decode()
         except KeysError as error:
@@ -70,6 +70,19 @@ def _list(args: argparse.Namespace) -> int:
     else:
         for kind, entries in (("own", own), (CLIENTS, clients)):
             write_lines(*(f"{kind:8} {printable(name)}  {key}" for name, key in entries.items()))
+    if not (own or clients or problems):
+        complain(f"{args.dir}: no {keys.SECRET} file, and no key in {CLIENTS}/")
     for problem in problems:
         complain(problem)
     return WRONG if problems else 0
+
+
+def _secret_keys(folder: Path) -> list[Path]:
+    """Return the secret key files of a folder; no files if the default folder is missing.
+    Raises `KeysError` for a folder that cannot be read."""
+    try:
+        return sorted(path for path in folder.iterdir() if path.suffix == keys.SECRET)
+    except OSError as error:
+        if folder == FOLDER and isinstance(error, FileNotFoundError):
+            return []
+        raise KeysError(f"{folder}: cannot list the keys: {error.strerror}") from error

@@ -198,6 +198,18 @@ def test_the_keys_command_makes_and_lists_keys_and_checks_rights(tmp_path: Path)
     assert graspd("keys", "list", "--dir", tmp_path).returncode == 2
 
 
+def test_listing_keys_of_a_missing_folder_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    missing = tmp_path / "kesy"
+    said = refused("keys", "list", "--dir", missing)
+    assert said == f"graspd: {missing}: cannot list the keys: No such file or directory\n"
+    monkeypatch.setattr("graspd.daemon.commands.keys.FOLDER", missing)
+    listed = graspd("keys", "list")  # before the first key is made
+    assert (listed.returncode, listed.stdout) == (0, "")
+    assert listed.stderr == f"graspd: {missing}: no .key_secret file, and no key in clients/\n"
+
+
 @pytest.mark.parametrize("command", ["check", "run"])
 def test_check_and_run_refuse_keys_that_others_may_replace(tmp_path: Path, command: str) -> None:
     make(tmp_path / "keys", "daemon")
