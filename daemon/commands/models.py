@@ -18,6 +18,8 @@ from graspd.models import trial, zoo
 from graspd.models.contract import MeasuredError, ModelContract, ModelError
 from graspd.models.runtime import read
 
+OUT = Path("runs")
+"""Folder of wrapped models unless `--out` says otherwise."""
 WRAP = "graspd.models.training.commands.wrap"
 TITLES = {
     "table": "the table it came with",
@@ -63,9 +65,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out",
         type=Path,
-        default=Path("runs"),
         metavar="DIR",
-        help="with wrap: folder for the model and its card (runs)",
+        help=f"with wrap: folder for the model and its card ({OUT})",
     )
     parser.add_argument("--json", action="store_true", help="the cards as JSON on stdout")
 
@@ -76,8 +77,13 @@ def run(args: argparse.Namespace) -> int:
     if len(args.what) > 1 + is_wrap or (is_wrap and (len(args.what) != 2 or not args.data)):
         raise UsageError("give one NAME, or `wrap FILE --data TABLE`")
     if is_wrap:
+        if args.json:
+            raise UsageError("--json is for cards: it does not go with wrap")
+        args.out = args.out or OUT
         code: int = importlib.import_module(WRAP).run(args)
         return code
+    if args.data or args.name is not None or args.out is not None:
+        raise UsageError("--data, --name and --out are for `wrap FILE`")
     if not args.what:
         cards = {name: _card_of(zoo.find(name)) for name in zoo.names()}
         lines = _listing({name: _parsed(content) for name, content in cards.items()})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from pathlib import Path
 
@@ -69,7 +70,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="say of each system what it is, which row of the paper it answers, and the command "
         "that makes that row",
     )
-    parser.add_argument("--json", action="store_true", help="print figures of each fold as JSON")
+    parser.add_argument(
+        "--json", action="store_true", help="print figures of each fold, or the list, as JSON"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -78,7 +81,11 @@ def run(args: argparse.Namespace) -> int:
     if args.list:
         from graspd.models.training.systems.explained import TITLES, explained
 
-        sys.stdout.write("\n".join(markdown_table(TITLES, explained())) + "\n")
+        if args.json:
+            rows = [dict(zip(TITLES, row, strict=True)) for row in explained()]
+            sys.stdout.write(json.dumps(rows, indent=2) + "\n")
+        else:
+            sys.stdout.write("\n".join(markdown_table(TITLES, explained())) + "\n")
         return 0
     from graspd.models.training.commands.evaluation import evaluate
     from graspd.models.training.evaluating.frame import LostWorkerError

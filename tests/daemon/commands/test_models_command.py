@@ -38,6 +38,21 @@ def test_models_refuses_a_damaged_model_or_a_wrong_card(own: Path) -> None:
         assert says in refused("models", own)
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--data", "t.csv"),
+        ("mlp", "--name", "mine"),
+        ("mlp", "--out", "runs"),
+        ("wrap", "net.onnx", "--data", "t.csv", "--json"),
+    ],
+)
+def test_options_without_effect_on_models_are_refused(words: tuple[str, ...]) -> None:
+    said = refused("models", *words)
+    assert said.startswith("graspd: --")
+    assert "wrap" in said
+
+
 @pytest.mark.parametrize("command", ["check", "run"])
 def test_a_users_model_that_changed_after_first_use_is_refused(
     command: str, own: Path, tmp_path: Path
