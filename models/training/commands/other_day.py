@@ -50,7 +50,9 @@ def judge_other_days(
     `systems`: empty for the default one. `epochs`: None for the systems' own.
     Raises `WrongInputError`, `DatasetError` and `ModelError`.
     """
-    if not args.test or bool(args.train) == bool(args.model):
+    if args.train and args.model:
+        raise WrongInputError("--train and --model exclude each other")
+    if not args.test or not (args.train or args.model):
         raise WrongInputError("--test needs --train or --model, and each of these needs --test")
     for option in OTHER_OPTIONS:
         if getattr(args, option):

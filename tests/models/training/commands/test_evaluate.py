@@ -119,6 +119,13 @@ def test_a_quick_run_writes_verdicts_and_results_table(data: Path, tmp_path: Pat
     assert "graspd evaluate: 17 trainings, 1 at once: about 2 s of processor time" in done.stderr
 
 
+def test_the_list_as_json_has_the_tables_cells() -> None:
+    head, _, *rows = graspd("evaluate", "--list").stdout.splitlines()
+    titles = head.strip("| ").split(" | ")
+    cells = [dict(zip(titles, row.strip("| ").split(" | "), strict=True)) for row in rows]
+    assert json.loads(graspd("evaluate", "--list", "--json").stdout) == cells
+
+
 def test_wrong_input_is_one_line_and_exit_code_2(data: Path, tmp_path: Path) -> None:
     own = tmp_path / "own.csv"
     write(own, table("own", 20, 0))
@@ -127,6 +134,8 @@ def test_wrong_input_is_one_line_and_exit_code_2(data: Path, tmp_path: Path) -> 
         (["svm", "--data", "nowhere"], "nowhere: no such folder"),
         (["svm"], "needs --data DIR, --own FILE, or both"),
         (["svm", "--train", own, "--test", own, "--own", own], "--own does not go with"),
+        (["--train", own, "--test", own, "--model", "svm"], "--train and --model exclude"),
+        (["--train", own], "--test needs --train or --model, and each of these needs"),
     ):
         done = graspd("evaluate", "--out", tmp_path / "out", *words)
         assert done.returncode == 2
