@@ -7,6 +7,8 @@ import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from itertools import takewhile
+from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 from graspd.daemon.process.text import did_you_mean
@@ -56,6 +58,15 @@ class Parser(argparse.ArgumentParser):
         except argparse.ArgumentError as error:
             said = f"{error.message}{did_you_mean(str(value), map(str, action.choices or ()))}"
             raise argparse.ArgumentError(action, said) from None
+
+
+def check_folder(folder: Path) -> None:
+    """Raise `UsageError` if no file can be made in a folder."""
+    try:
+        with TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise UsageError(f"{folder}: {error.strerror}") from error
 
 
 def within(lowest: float, highest: float) -> Callable[[str], float]:

@@ -65,7 +65,10 @@ def _get(args: argparse.Namespace, file: TableFile) -> str:
         if _digest(_read(target)) == file.sha256:
             return f"{target}: is there"
     content = _from_folder(args.folder, file) if args.folder else _fetch(args.url, file)
-    write_atomically(target, content, mode=0o644)
+    try:
+        write_atomically(target, content, mode=0o644)
+    except OSError as error:  # it names a temporary file
+        raise DataError(f"{target}: {error.strerror}") from error
     return f"{target}: {file.rows} grasps"
 
 

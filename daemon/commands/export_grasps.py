@@ -9,12 +9,12 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from graspd.daemon.commands.arguments import UsageError
+from graspd.daemon.commands.arguments import UsageError, check_folder
 from graspd.daemon.process.files import write_atomically
 from graspd.daemon.process.text import complain, write_lines
 from graspd.daemon.publish.messages import OBJECT_PATTERN
 from graspd.drivers.recordings.kinds import STANDARD_INPUT, files_of
-from graspd.extras import needs
+from graspd.extras import require
 
 if TYPE_CHECKING:
     from graspd.daemon.record.export import Export
@@ -63,6 +63,10 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("--parquet needs a file for --out; to - goes CSV")
     if not to_stdout and args.out.exists() and not args.force:
         raise UsageError(f"{args.out} is there already: --force replaces it")
+    if not to_stdout:
+        check_folder(args.out.parent)  # now, not after minutes of reading
+    if args.parquet:
+        _require_parquet()
     from graspd.daemon.record.export import collect, write
 
     with files_of(args.recordings) as files:
@@ -84,12 +88,19 @@ def run(args: argparse.Namespace) -> int:
             write(table, export, args.object)
             content = table.getvalue().encode()
         write_atomically(args.out, content, mode=0o644)
-    except ModuleNotFoundError as error:
-        raise UsageError(needs("--parquet", "pandas", error)) from error
     except OSError as error:
         complain(f"{args.out}: {error.strerror or error}")
         return FAILED
     return 0
+
+
+def _require_parquet() -> None:
+    """Raise `UsageError` without the packages that write Parquet."""
+    try:
+        for package in ("pandas", "pyarrow"):
+            require(package, "--parquet", "pandas")
+    except ModuleNotFoundError as error:
+        raise UsageError(str(error)) from error
 
 
 def _summary(export: Export) -> str:

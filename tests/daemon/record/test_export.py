@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -28,7 +29,7 @@ from graspd.drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
 from graspd.models.training.data.datasets import read_table
 from tests.daemon.record import recorded
 from tests.daemon.record.recorded import BOOT
-from tests.kit.inside import graspd, output
+from tests.kit.inside import graspd, output, refused
 from tests.kit.scenes import demo_scene
 
 Ending = Literal["stable", "slip"]
@@ -229,6 +230,17 @@ def test_standard_streams_serve_as_recording_and_as_table(
     assert (done.returncode, done.stdout) == (0, (tmp_path / "t.csv").read_text())
     assert done.stderr == "graspd: 1 grasps, 1 slipped; 1 objects by name\n"
     assert not Path("-").exists()
+
+
+def test_an_unusable_folder_or_missing_extra_is_refused_unread(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    unread, missing = tmp_path / "not-there.mcap", tmp_path / "missing"
+    said = refused("export-grasps", unread, "--out", missing / "t.csv")
+    assert said == f"graspd: {missing}: No such file or directory\n"
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    said = refused("export-grasps", unread, "--out", tmp_path / "t.parquet", "--parquet")
+    assert said.startswith("graspd: --parquet needs the package 'pyarrow'")
 
 
 @pytest.mark.parametrize("name", ["=HYPERLINK(0)", "mug\n=1"])
