@@ -99,14 +99,61 @@ def test_a_piped_table_is_wrapped_and_a_repeated_one_refused(
     assert f"{table}: has counts twice: the same grasp counts once" in done.stderr
 
 
-def test_a_networks_single_output_is_read_as_slip_log_odds(folder: Path) -> None:
-    class Ramp(torch.nn.Module):
-        """Last electrode of the first finger less its first one: negative in a stable grasp."""
+def rising(*signs: float, over: int = 24, bias: float = 0.0) -> torch.nn.Linear:
+    """Return a layer with an output for each sign: positive ones rise with slip, as the counts do.
 
-        def forward(self, counts: torch.Tensor) -> torch.Tensor:
-            return 0.01 * (counts[:, 23:24] - counts[:, :1])
+    `over`: number of electrodes of the first finger whose last and first one are compared.
+    """
+    layer = torch.nn.Linear(72, len(signs))
+    weight = torch.zeros(len(signs), 72)
+    weight[:, over - 1], weight[:, 0] = 0.01 * torch.tensor(signs), -0.01 * torch.tensor(signs)
+    layer.weight, layer.bias = torch.nn.Parameter(weight), torch.nn.Parameter(0.0 * weight[:, 1])
+    layer.bias.data += bias
+    return layer
 
-    assert "F1 100.0 % on the table itself" in wrapped(folder, Ramp(), (1, 72))
+
+def then(*layers: torch.nn.Module) -> torch.nn.Module:
+    return torch.nn.Sequential(*layers)
+
+
+RIGHT = {
+    "log-odds": (rising(1.0), 100.0),
+    "logits": (rising(-1.0, 1.0), 100.0),
+    "probabilities": (then(rising(-1.0, 1.0), torch.nn.Softmax(1)), 100.0),
+    "weak log-odds in 0..1": (then(rising(0.01, over=2, bias=0.5), torch.nn.Flatten()), 66.7),
+    "one answer to all": (rising(0.0, bias=0.5), 66.7),
+    "one pair of logits to all": (rising(0.0, 0.0, bias=0.2), 66.7),
+}
+"""Networks with their F1: `slip` of all grasps, half of which slipped, has 2/3."""
+
+
+@pytest.mark.parametrize(("network", "f1"), RIGHT.values(), ids=RIGHT)
+def test_a_network_of_slips_is_wrapped_however_weak(
+    folder: Path, network: torch.nn.Module, f1: float
+) -> None:
+    assert f"F1 {f1} % on the table itself" in wrapped(folder, network, (1, 72))
+
+
+SIGMOID = "leave the last Sigmoid out"
+MISREAD = {
+    "slip before stable": (then(rising(1.0, -1.0), torch.nn.Softmax(1)), "(slip, stable)?"),
+    "weak slip before stable": (rising(1.0, -1.0, over=4), "(slip, stable)?"),
+    "log-odds of stable": (rising(-1.0), "log-odds of stable?"),
+    "a probability": (then(rising(1.0), torch.nn.Sigmoid()), SIGMOID),
+    "a constant probability": (then(rising(0.0), torch.nn.Sigmoid()), SIGMOID),
+    "a reshaped one": (then(rising(0.0), torch.nn.Sigmoid(), torch.nn.Flatten()), SIGMOID),
+    "a clipped one": (then(rising(0.1, bias=0.5), torch.nn.Hardtanh(0.0, 1.0)), SIGMOID),
+    "two probabilities": (then(rising(-1.0, 0.5), torch.nn.Sigmoid()), "do not add up to 1"),
+}
+
+
+@pytest.mark.parametrize(("network", "why"), MISREAD.values(), ids=MISREAD)
+def test_an_output_of_another_meaning_is_refused(
+    folder: Path, network: torch.nn.Module, why: str
+) -> None:
+    said = wrapped(folder, network, (1, 72))
+    assert said.startswith("graspd: ")
+    assert why in said
 
 
 class Flat(torch.nn.Linear):
@@ -148,5 +195,5 @@ def test_a_network_refused_by_the_trial_is_named_itself(
         raise ModelError(f"{path}: takes too long")
 
     monkeypatch.setattr(trial, "load", too_slow)
-    said = wrapped(folder, torch.nn.Linear(72, 2), (1, 72))
+    said = wrapped(folder, rising(1.0), (1, 72))
     assert said == f"graspd: {folder / 'other.onnx'}: takes too long\n"
