@@ -149,7 +149,10 @@ class _Reader:
             if field_number == 8:
                 name = _text(value)
             elif field_number == 13 or (field_number == 14 and value != 0):
-                raise ModelError("has weights in another file: its digest would not be theirs")
+                raise ModelError(
+                    "has weights in another file, which its digest leaves out: export it with "
+                    "external_data=False"
+                )
         return name
 
     def _check_node(self, node: _Node) -> None:

@@ -29,7 +29,7 @@ from graspd.models.contract import (
     ModelError,
 )
 from graspd.models.inputs import builder
-from graspd.models.runtime import one_line, single_threaded
+from graspd.models.runtime import check_operators, one_line, single_threaded
 from graspd.models.training.commands.common import read_each
 from graspd.models.training.data.datasets import DatasetError, Grasps, check_once, concatenate
 from graspd.models.training.data.protocols import FOLDS, object_folds
@@ -112,7 +112,7 @@ def _measured(source: Path, grasps: Grasps) -> tuple[MeasuredError, onnx.ModelPr
             network = source.read_bytes()
         except OSError as error:
             raise ModelError(f"{source}: cannot read: {error.strerror}") from error
-        model = _with_ends(network, grasps)
+        model = _with_ends(source, network, grasps)
         return _error("table", [_scores(model, grasps, np.arange(len(grasps)))]), model
     train: Train | None = runpy.run_path(str(source)).get("train")
     if train is None:
@@ -124,9 +124,11 @@ def _measured(source: Path, grasps: Grasps) -> tuple[MeasuredError, onnx.ModelPr
     scores = []
     for fold in range(folds):
         rows = np.flatnonzero(fold_of != fold)
-        model = _with_ends(train(grasps.counts[rows], grasps.slipped[rows]), grasps)
+        network = train(grasps.counts[rows], grasps.slipped[rows])
+        model = _with_ends(source, network, grasps)
         scores.append(_scores(model, grasps, np.flatnonzero(fold_of == fold)))
-    return _error("objects", scores), _with_ends(train(grasps.counts, grasps.slipped), grasps)
+    network = train(grasps.counts, grasps.slipped)
+    return _error("objects", scores), _with_ends(source, network, grasps)
 
 
 def _scores(model: onnx.ModelProto, grasps: Grasps, rows: NDArray[np.int64]) -> tuple[float, float]:
@@ -162,8 +164,9 @@ def _session(network: bytes) -> Any:  # noqa: ANN401 - onnxruntime has no types
         raise ModelError(f"not a usable ONNX model: {one_line(error)}") from error
 
 
-def _with_ends(network: bytes, grasps: Grasps) -> onnx.ModelProto:
+def _with_ends(source: Path, network: bytes, grasps: Grasps) -> onnx.ModelProto:
     """Return the network with the daemon's input and output. Raises `ModelError`."""
+    check_operators(source, network)  # onnxruntime would look for weights in the current folder
     fingers = len(grasps.fingers)
     session = _session(network)
     inputs, outputs = session.get_inputs(), session.get_outputs()

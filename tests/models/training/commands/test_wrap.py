@@ -13,6 +13,7 @@ import pytest
 
 pytest.importorskip("torch", reason="needs the extra `train`")
 
+import onnx
 import torch
 
 import graspd
@@ -163,19 +164,20 @@ class Flat(torch.nn.Linear):
         return super().forward(counts)[0]
 
 
+class Deep(torch.nn.Linear):
+    """Gives probabilities of shape (n, 1, 2)."""
+
+    def forward(self, counts: torch.Tensor) -> torch.Tensor:
+        return super().forward(counts).softmax(1).unsqueeze(1)
+
+
 OTHERS: dict[str, tuple[torch.nn.Module, tuple[int, ...], tuple[int, ...]]] = {
     "two fingers": (torch.nn.Linear(48, 2), (1, 48), (0,)),
     "three classes": (torch.nn.Linear(72, 3), (1, 72), (0,)),
     "an answer per finger": (torch.nn.Linear(24, 2), (1, 3, 24), (0,)),
     "a batch of 32": (torch.nn.Linear(72, 2), (32, 72), ()),
     "one answer without its axis": (Flat(72, 2), (1, 72), (0,)),
-    "probabilities of three axes": (
-        torch.nn.Sequential(
-            torch.nn.Linear(72, 2), torch.nn.Softmax(1), torch.nn.Unflatten(1, (1, 2))
-        ),
-        (1, 72),
-        (0,),
-    ),
+    "probabilities of three axes": (Deep(72, 2), (1, 72), (0,)),
 }
 
 
@@ -186,6 +188,22 @@ def test_a_network_of_another_shape_is_refused(
     said = wrapped(folder, *other)
     assert said.startswith("graspd: ")
     assert "must take float counts (n, 3, 24)" in said
+
+
+def test_weights_in_another_file_are_refused_with_advice(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = onnx.load(folder / "net.onnx")
+    path = folder / "apart.onnx"
+    onnx.save_model(
+        model, path, save_as_external_data=True, location="apart.data", size_threshold=0
+    )
+    for place in (folder, folder.parent):
+        monkeypatch.chdir(place)
+        done = command("models", "wrap", path, "--data", folder / "own.csv", "--out", folder)
+        assert done.returncode == 2
+        assert done.stderr.startswith(f"graspd: {path}: has weights in another file")
+        assert "external_data=False" in done.stderr
 
 
 def test_a_network_refused_by_the_trial_is_named_itself(
