@@ -32,7 +32,8 @@ ENOUGH_GRASPS = 200
 Trained on 20 grasps of palm_45, the daemon refuses 98 % of its others as unlike the training; on
 100 grasps 20 %, on 200 6 %, on 500 2.5 %.
 """
-
+UNNAMED = "unknown"
+"""Object of a table without object names, as `graspd export-grasps` calls it."""
 
 DatasetError = RecordingError
 """A grasp table is missing or has wrong content. A retry cannot succeed."""
@@ -106,6 +107,8 @@ class Grasps:
 def read_table(path: Path, read_as: ReadAs | None = None) -> Grasps:
     """Read the grasps of one table that have an outcome.
 
+    Without object names all grasps are of one object, `UNNAMED`.
+
     Pass `read_as="table"` for a table in which many rows repeat each other. Raises
     `DatasetError`, with file, line and column.
     """
@@ -114,10 +117,10 @@ def read_table(path: Path, read_as: ReadAs | None = None) -> Grasps:
     fingers = layout.columns.fingers
     if layout.is_stream:
         raise DatasetError(path, "is a stream: its rows are sweeps, and not grasps")
-    for name, place in ((OBJECT, layout.columns.object), (SLIPPED, layout.columns.slipped)):
-        if place is None:
-            raise DatasetError(path, "column is missing", line=1, column=name)
-    objects: list[str] = []
+    if layout.columns.slipped is None:
+        raise DatasetError(path, "column is missing", line=1, column=SLIPPED)
+    objects: list[str | None] = []
+    nameless: list[int | None] = []
     slipped: list[bool] = []
     counts: list[NDArray[np.uint16]] = []
     without = 0
@@ -127,16 +130,18 @@ def read_table(path: Path, read_as: ReadAs | None = None) -> Grasps:
             without += 1
             continue
         if note.object_name is None:
-            raise DatasetError(path, "object has no name", line=note.line, column=OBJECT)
+            nameless.append(note.line)
         objects.append(note.object_name)
         slipped.append(note.slipped)
         counts.append(row.counts)
     if not counts:
         raise DatasetError(path, "has no grasp with an outcome")
+    if 0 < len(nameless) < len(counts):
+        raise DatasetError(path, "object has no name", line=nameless[0], column=OBJECT)
     return Grasps(
         np.array(counts),
         np.array(slipped, dtype=np.bool_),
-        tuple(objects),
+        tuple(name or UNNAMED for name in objects),
         (Dataset(table_name(path), hashlib.sha256(data).hexdigest(), len(counts)),),
         without,
         fingers,

@@ -87,6 +87,14 @@ def test_a_broken_table_is_refused_with_its_line_number(
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("column", ["object", "about"], ids=["blank", "missing"])
+def test_a_table_without_object_names_has_one_object(tmp_path: Path, column: str) -> None:
+    path, counts = tmp_path / "lab.csv", separable_counts(20)
+    write_table(path, *counts, [""] * 20)
+    path.write_text(path.read_text().replace("object", column, 1))
+    assert read_table(path).objects == ("unknown",) * 20
+
+
 def test_missing_files_and_folders_are_named(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="nowhere: no such folder"):
         read_all(tmp_path / "nowhere")
