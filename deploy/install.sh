@@ -343,11 +343,12 @@ settle() {
             sed -i "s|$root/|/|g" "$file"
         done
         set -- -f -s "$root" -p /
+    else
+        # What graspd never imports, a third, stays as it is.
+        set -- -x '/site-packages/((pip|setuptools|pkg_resources)|.*/tests)/'
     fi
-    # What graspd never imports, a third, stays as it is. A module that does not compile is one
-    # that is never used: pip does not mind either.
-    unused='/site-packages/((pip|setuptools|pkg_resources)|.*/tests)/'
-    "$new/bin/python" -I -m compileall -qq -j 0 -x "$unused" "$@" "$new/lib" || true
+    # A module that does not compile is one that is never used: pip does not mind either.
+    "$new/bin/python" -I -m compileall -qq -j 0 "$@" "$new/lib" || true
 }
 
 # Former environments, except those that a running graspd still uses.
