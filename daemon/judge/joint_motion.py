@@ -122,9 +122,10 @@ class JointMotion:
             del past[0]
         if now_ns - past[0][0] < WINDOW_NS:
             return False
-        oldest_ns, oldest = past[0]
-        if abs(oldest - now) > RAD_PER_S * (now_ns - oldest_ns) / 1e9:
-            return False
         # Each angle of the window is compared with the newest: the ends alone would miss a swing.
-        angles, most = [angle for _, angle in past[1:]], RAD_PER_S * WINDOW_NS / 1e9
-        return max(angles) - now <= most and now - min(angles) <= most
+        most = RAD_PER_S * WINDOW_NS / 1e9
+        for _, angle in past[1:]:
+            if not abs(angle - now) <= most:
+                return False
+        oldest_ns, oldest = past[0]
+        return abs(oldest - now) <= RAD_PER_S * (now_ns - oldest_ns) / 1e9
