@@ -21,7 +21,7 @@ WINDOW = 100
 READ_MIN = 60
 """Fewest of the sweeps of a window in which an electrode with a baseline was usable, of `WINDOW`.
 
-A link that loses 5 % of single samples leaves nearly all electrodes as many. An electrode that is
+Nearly all electrodes have as many on a link that loses 5 % of single samples. An electrode that is
 broken for longer has no baseline.
 """
 TARE_EVERY = 25
@@ -69,7 +69,8 @@ SIGMA_MIN_COUNTS = 1.5
 SIGMA_MAX_COUNTS = 10.0
 """Largest noise of the median electrode of a finger at rest, counts; measured 2.9 to 4.3."""
 TREND_MAX_COUNTS = 5.0
-"""Largest change of the median electrode of a finger at rest within a window, counts."""
+"""Largest change of a finger at rest from one half of a window to the other, counts (median of its
+electrodes)."""
 UP_COUNTS_PER_S, DOWN_COUNTS_PER_S = 5.0, 1.5
 """Largest speeds at which a baseline rises and falls.
 
@@ -100,7 +101,7 @@ class Touch:
     lowest: float = 0.0
     """Smallest fall since the finger let go, counts; the next touch is `threshold` above it."""
     let_go_ns: int | None = None
-    """Time of the end of the last touch. None: it never touched."""
+    """Time at which the last touch ended. None: none has ended yet."""
     since_ns: int | None = None
     """Time at which the touch began. None: the finger does not touch."""
     alone_since_ns: int | None = None
@@ -152,7 +153,8 @@ class Touch:
         """Return True if the finger must be tared again. Call it while not all fingers touch.
 
         Reasons for a new tare: a long hold has ended, the whole finger rests above its baseline, or
-        it has touched alone for over `ALONE_NS`. `middle`: fall of its median electrode, counts.
+        it has touched for over `ALONE_NS` while not all fingers do. `middle`: fall of its median
+        electrode, counts.
         """
         if not self.touching:
             # A finger that rests higher was tared while it touched, or has drifted far.

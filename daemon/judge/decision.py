@@ -27,13 +27,14 @@ class GateLimits:
     """Limits of the gate that a scene may set."""
 
     false_alarms: float = 0.03
-    """Share of sweeps, 0..0.5, in which a hand that holds still may be reported as moving.
+    """Share of sweeps, between 0 and 0.5, in which a hand that holds still may count as moving.
 
     A larger share lets slower slides be seen: deploy/JUDGING.md. Until the hand has settled the
     limit of motion is stricter.
     """
     early: bool = False
-    """True: judge once fast motion is excluded, and again once slow slides are excluded."""
+    """True: judge once fast motion is excluded, and again once slow slides are excluded.
+    False: judge only once both are."""
     request_ns: int = 1_000_000_000
     """Time after which an unanswered request to judge is dropped, ns."""
 
@@ -43,7 +44,7 @@ class HandLimits:
     """Limits of a hand's grasp: which fingers must touch, and how still they must keep."""
 
     on_request: bool = False
-    """True if a settled grasp is judged only when the controller asks."""
+    """True if the first judgement of a settled grasp waits until the controller asks."""
     required: tuple[Finger, ...] | None = None
     """Fingers that must touch. None: all."""
     gate: GateLimits = field(default_factory=GateLimits)
@@ -107,7 +108,7 @@ def decide(
     `p_slip`: probability of slip, 0..1; None: the network gave none. `objections`: reasons against
     this reading, or against the earlier one that the network judged. `moment`: state of the grasp.
     `age_ns`: age of the reading. `withheld`: why the risk forbids `stable`; None: it does not.
-    `held`: an earlier judgement that still forbids `stable`, if any.
+    `held`: an earlier judgement; if it was not `stable`, its decision takes the place of `stable`.
     """
     reasons = [*objections]
     if not (moment.in_contact and moment.settled):

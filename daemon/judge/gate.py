@@ -29,7 +29,7 @@ REFRESH_NS = 50_000_000
 """Age at which a verdict is refreshed, ns: half of `STANDS_NS`, so that it is never older than
 that, even with slow readings of which one is lost."""
 STANDS_NS = 100_000_000
-"""Largest age of a verdict, ns. After it, even a reading without new values is judged."""
+"""Largest age of a verdict, ns. After it a reading is judged even if fresh values are missing."""
 CHANGE_COUNTS = 40.0
 """Largest mean change of a finger's electrodes since the first judgement after settling, counts.
 Above it the grasp must settle again."""
@@ -101,7 +101,8 @@ class Question:
     """Says when the network must judge: the controller asks, or the verdict grows old."""
 
     def __init__(self, on_request: bool, lasts_ns: int) -> None:
-        """`on_request`: judge only when asked. `lasts_ns`: time until a question is dropped, ns."""
+        """`on_request`: settled grasps are first judged when asked for. `lasts_ns`: time until a
+        question is dropped, ns."""
         self._on_request = on_request
         self._lasts_ns = lasts_ns
         self.asked = False
@@ -130,7 +131,7 @@ class Question:
     def is_due(self, t_ns: int, fresh: bool) -> bool:
         """Return True if a judged grasp is to be judged again by the reading of `t_ns`.
 
-        `fresh`: the reading has new values.
+        `fresh`: each usable electrode has three fresh values.
         """
         age_ns = t_ns - self._judged_ns
         return age_ns > STANDS_NS or (fresh and (self.asked or age_ns >= REFRESH_NS))
@@ -194,9 +195,9 @@ class Gate:
 
         `median`: counts, shape (fingers, 24). `usable`: electrodes that can be used, same shape;
         None: all. `objections` of other parts, such as moving joints, keep the grasp from settling.
-        `in_time`: the reading is not late; only then it is judged. `fresh`: it has new values;
-        without them it is judged only if the verdict is older than `STANDS_NS`. `fingers` goes
-        into the moment as it is.
+        `in_time`: the reading is not late; only then it is judged. `fresh`: each usable electrode
+        has three fresh values (`FreshMedian`); else the reading is judged only if the verdict is
+        older than `STANDS_NS`. `fingers` goes into the moment as it is.
         """
         phase, still, motion = self.phase, self._still, self._motion
         self._last_ns = t_ns
@@ -334,14 +335,14 @@ class Gate:
         return (Reason.MOVING,) if limits.early else ()
 
     def _is_due(self, t_ns: int, fresh: bool) -> bool:
-        """Return True if this reading is the one to judge; `fresh`: it has new values."""
+        """Return True if this reading is the one to judge; `fresh`: as of `step`."""
         if self.phase.state is GateState.JUDGED:
             return self._question.is_due(t_ns, fresh)
         is_asked = self._still.early or self._question.is_asked
         return fresh and is_asked and self.phase.state is GateState.SETTLED
 
     def _judge(self, t_ns: int, median: NDArray[np.uint16]) -> bool:
-        """Enter `judged`, or stay there; return False if this is only a periodic refresh."""
+        """Enter `judged`, or stay there; return False if this only refreshes the verdict."""
         first = self.phase.state is not GateState.JUDGED
         if first:
             # A later judgement keeps it. Otherwise a grasp that creeps would never count as

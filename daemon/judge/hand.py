@@ -50,7 +50,7 @@ class FreshMedian:
     def __init__(self, shape: tuple[int, int]) -> None:
         """`shape` is (fingers, 24)."""
         self.counts = np.zeros(shape, dtype=np.uint16)
-        """Median of the last three fresh values, shape (fingers, 24); 0 where there is none."""
+        """Median of the last three fresh values, shape (fingers, 24); 0 where none ever was."""
         self._fresh = np.zeros((MEDIAN_SWEEPS, *shape), dtype=np.uint16)
         """The last three fresh values, oldest first, shape (3, fingers, 24)."""
         self._last = np.full(shape, NO_COUNT, dtype=np.uint16)
@@ -91,7 +91,10 @@ class FreshMedian:
         self.counts = np.maximum(low, np.minimum(high, newest))
 
     def is_full(self, usable: NDArray[np.bool_] | None) -> bool:
-        """Return True if each `usable` electrode has three fresh values."""
+        """Return True if each `usable` electrode (None: all) has three fresh values.
+
+        They are counted since a `reset`, and since the electrode was last not usable.
+        """
         if self._all_full or usable is None:
             return self._all_full
         return bool((self._number[usable] == MEDIAN_SWEEPS).all())
@@ -197,7 +200,8 @@ class HandTracker:
         return findings
 
     def forget(self) -> None:
-        """Forget tare and grasp. Call when sensors were exchanged, or may have been."""
+        """Forget tare and noise, so that the grasp ends with the next usable reading. Call when
+        sensors were exchanged, or may have been."""
         self._contact.forget()
         self.motion.forget()
         self._fresh.reset()
@@ -275,7 +279,7 @@ class HandTracker:
         return self.gate.moment(touching, dict.fromkeys(self._fingers))
 
     def _feel(self, t_ns: int) -> dict[Finger, FingerState | None]:
-        """Return the state of each finger at the reading just observed."""
+        """Return the state of each finger at the reading just observed; None: not known."""
         motion, loose, contact = self.motion, self.motion.loose, self._contact
         feelings: dict[Finger, FingerState | None] = {}
         for place, finger in enumerate(self._fingers):
@@ -293,8 +297,8 @@ class HandTracker:
         return feelings
 
     def _follow_time(self, t_ns: int) -> None:
-        """Have the grasp settle again if the usable reading of `t_ns` comes after a gap; after an
-        outage, forget the tare and the noise too."""
+        """Have the grasp settle again if the usable reading of `t_ns` comes after a gap or after
+        `interrupt`; after an outage, forget the tare and the noise too."""
         last_ns = self._last_ns
         if last_ns is not None and not -OUTAGE_NS <= t_ns - last_ns <= OUTAGE_NS:
             self._contact.forget()

@@ -30,17 +30,17 @@ REPAIRABLE = int(
 """Bits of faults that concern one electrode. Any other bit makes the whole reading unusable."""
 
 UNCHANGED_MAX = 16
-"""Readings in a row with the same count after which an electrode counts as dead.
+"""Readings in a row that repeat an electrode's count, after which it counts as dead.
 
 The noise of a live one is 3 to 4 counts (standard deviation). It keeps its count about once in ten
 readings, never 16 times in a row.
 """
 JUMP_COUNTS = 150
-"""Smallest step of a jump, counts. Spikes of a live electrode are 25 to 150 counts high."""
+"""A larger step is a jump, counts. Spikes of a live electrode are 25 to 150 counts high."""
 STILL_COUNTS = 30
 """Largest step of an electrode that keeps still, counts."""
 STILL = 20
-"""Fewest electrodes of a finger, of 24, that must keep still when another one jumps.
+"""Fewest electrodes of a finger, of 24, that must keep still for a step of another to be a jump.
 
 A finger that touches moves many electrodes. In a table each reading is another grasp, and nearly
 all differ.

@@ -40,7 +40,7 @@ class JointMotion:
         self.latest_ns: dict[str, int] = {}
         """Time of the last angle of each joint, ns."""
         self.lost: list[str] = []
-        """Joints whose angles no longer come."""
+        """Joints whose angles stopped coming at some time; they may have come back."""
         self._waits_since_ns: int | None = None
         """Time since which no joint is known. None: not noticed yet."""
         self._changed_ns: int | None = None

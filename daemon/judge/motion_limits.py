@@ -72,7 +72,8 @@ class MotionLimits:
         self.fast = self.slow = self._ones
         """Largest motion of each finger over the short and over the long window."""
         self.early = self.sure = False
-        """`early`: True if all fingers are within `fast`. `sure`: within `slow` too."""
+        """`early`: all fingers are within `fast`. `sure`: within `slow` and, in the short window,
+        within the limit of `Tails.fast`, which is looser than `fast` with `early` judging."""
 
     def lay(
         self,

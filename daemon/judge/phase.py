@@ -42,7 +42,7 @@ class Phase:
     def __init__(self) -> None:
         self.state = IDLE
         self.grasp = 0
-        """Number of the current grasp, which is the number of first touches so far."""
+        """Number of the current grasp; each first touch adds one."""
         self.changes: list[GateChange] = []
         """Changes since the last `Moment`: at most three by a reading, and one by a restart."""
 

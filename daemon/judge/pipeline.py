@@ -135,7 +135,7 @@ class Pipeline:
 
     @property
     def on_request(self) -> bool:
-        """True if a settled grasp is judged only when the controller asks."""
+        """True if the first judgement of a settled grasp waits until the controller asks."""
         return self.hand.on_request
 
     def session_then(self) -> SessionState | None:
@@ -164,7 +164,8 @@ class Pipeline:
         """Forget session, grasp, learning and, unless `known.tared`, the tare: new sensors.
 
         From then on nothing is judged before the session is calibrated. `known`: what is known of
-        the new sensors, to start from; None: nothing. Raises `ValueError` if of another model.
+        the new sensors, to start from; None: nothing. Raises `ValueError`, half done, if that is
+        of another model; then call it again without.
         """
         if known is None:
             # A scene that keeps no session never needs it.
@@ -198,7 +199,7 @@ class Pipeline:
         self.hand.interrupt()
 
     def observe_joints(self, reading: JointReading) -> None:
-        """Take in joint angles."""
+        """Take in joint angles; if they are `interrupted`, the grasp must settle again."""
         if reading.interrupted:
             self.skip()
         self.hand.observe_joints(reading)
@@ -206,7 +207,7 @@ class Pipeline:
     def judge(self, reading: TactileReading) -> Judgement:
         """Return the judgement of a reading: `unknown` unless its grasp has settled.
 
-        Bad data gives `unknown`; it never raises.
+        Bad data gives `unknown`, never an exception.
         """
         if reading.interrupted:
             self.skip()

@@ -207,7 +207,7 @@ class GateState(StrEnum):
     JUDGED = "judged"
     """The verdict stands, and is refreshed while readings confirm that the grasp is the same."""
     RELEASED = "released"
-    """The last finger let go less than `RELEASE_NS` of the gate ago; a new touch may follow."""
+    """The last finger let go less than `gate.RELEASE_NS` ago; a new touch may follow."""
 
 
 OPEN = frozenset({GateState.IDLE, GateState.RELEASED})
@@ -261,9 +261,9 @@ class Moment(NamedTuple):
     judges: bool = True
     """True if the network is to judge the grasp by this reading."""
     judged: bool = True
-    """True for the first judgement after settling and the answer to a request; False: a refresh.
+    """True for the first judgement after settling and, with `on_request`, the answer to a request.
 
-    Without a gate it is True for each reading, sound or not.
+    False: a refresh, or no judgement. Without a gate it is True for each reading, sound or not.
     """
     in_contact: bool = True
     """True if all required fingers touch."""
@@ -275,7 +275,7 @@ class Moment(NamedTuple):
     changes: tuple[GateChange, ...] = ()
     """Changes of the gate since the moment before, oldest first."""
     still_ms: float | None = None
-    """Time for which the hand has touched and kept still, ms."""
+    """Time for which the hand has touched and kept still, ms; None: not known."""
     early: bool = False
     """True if it was judged while something might still slide slowly."""
     steady: bool = True

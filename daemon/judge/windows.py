@@ -32,7 +32,7 @@ BLOCK_STEPS, BLOCKS = 24, 16
 """Steps of a block, and number of blocks kept: about 4 s at 100 Hz. The noise is the lower quartile
 of the blocks, so a hand that closes or opens does not change it."""
 LOST_MAX = 3
-"""Most sweeps in a row for which an unusable electrode keeps its last value."""
+"""Most sweeps in a row in which the last value of an unusable electrode stands for the new ones."""
 MEAN_ABS = math.sqrt(2.0 / math.pi)
 """Mean absolute value of a Gaussian of standard deviation 1."""
 SLOPE_ECHO = np.zeros((STEPS + 1, APART - 1))

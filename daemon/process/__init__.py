@@ -13,6 +13,6 @@ LIBRARIES = {
 
 
 def set_up_libraries() -> None:
-    """Set `LIBRARIES`. Call before the first library is imported."""
+    """Set those of `LIBRARIES` that are not set. Call before the first library is imported."""
     for name, value in LIBRARIES.items():
         os.environ.setdefault(name, value)
