@@ -14,7 +14,7 @@ from graspd.daemon.process.logs import LOGGER
 
 
 def graspd(*arguments: object) -> CompletedProcess[str]:
-    """Run `graspd` with `arguments` in this process; return its exit code and output."""
+    """Run `graspd` with `arguments` in this process; return exit code, output and errors."""
     words = [str(argument) for argument in arguments]
     output, errors = io.StringIO(), io.StringIO()
     with (

@@ -110,8 +110,8 @@ class LoopBench(Companion):
         """`stop` None: the bench has one of its own, which `run` closes. `keep`: calls its
         argument once all outcomes are on the disk. `timing` None: of `max_age_ms` and `sleep`.
 
-        With `cost_ns`, which replaces both, the clock moves only in waits, and at each verdict by
-        its result, ns.
+        With `cost_ns`, which replaces `timing` and `sleep`, the clock moves only in waits, and at
+        each verdict by its result, ns.
         """
         self.driver = driver
         self.clock = clock
@@ -149,7 +149,7 @@ class LoopBench(Companion):
         )
 
     def run(self) -> Ended:
-        """Run the loop to its end."""
+        """Run the loop to its end; return why it ended."""
         with closing(self.loop), self._stop if self._owns_stop else nullcontext():
             return self.loop.run()
 

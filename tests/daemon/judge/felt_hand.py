@@ -40,7 +40,7 @@ TURN_RAD = 0.01
 
 
 def _poses() -> dict[str, NDArray[np.int64]]:
-    """Counts without noise, shape (3, 24), within what the fake model has seen."""
+    """Return counts without noise, shape (3, 24), by name; the fake model has seen such."""
     random = np.random.default_rng(5)
     rest = random.integers(2000, 3000, (3, 24))
     grasp, other, light, faint, two = (rest.copy() for _ in range(5))

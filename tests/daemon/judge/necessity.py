@@ -202,7 +202,8 @@ class Necessity:
         self._drop_joints(t_ns)
 
     def _depths(self) -> NDArray[np.float64]:
-        """Return the largest possible fall of each finger, counts, shape (fingers,)."""
+        """Return how far the third deepest electrode of each finger may at most be below its median
+        one, counts, shape (fingers,)."""
         nearest = self._values[:NEAREST]
         most, least = self._rest - nearest.min(axis=0), self._rest - nearest.max(axis=0)
         third = np.sort(np.where(self._sick > 0, np.inf, most), axis=1)[:, -3]

@@ -23,7 +23,7 @@ REST = np.full((1, 24), 3000, dtype=np.uint16)
 
 Counts = NDArray[np.uint16]
 Story = list[tuple[float, float, bool]]
-"""Time, s, fall, counts, and whether the finger touches then."""
+"""Sweeps, each: time, s; fall, counts; whether the finger then touches."""
 
 NS = 1e-9
 STORIES: dict[str, Story] = {
@@ -76,7 +76,7 @@ def test_a_touch_needs_a_fall_below_baseline_and_median_electrode(
 
 
 def held(*, for_ns: int, fall: float) -> Touch:
-    """Return a finger that has touched since 1 s, after a sweep `for_ns` later with this `fall`."""
+    """Return a finger that touched from 1 s on, after a sweep `for_ns` later with this `fall`."""
     touch = Touch(THRESHOLD)
     touch.follow(S, 0.0, 100.0, 100.0)
     touch.follow(S + for_ns, 0.0, fall, fall)
@@ -94,7 +94,7 @@ def held(*, for_ns: int, fall: float) -> Touch:
         (held(for_ns=60 * S + 1, fall=99.0), -99.0, False),
     ],
 )
-def test_a_finger_risen_or_released_after_long_is_tared_again(
+def test_fingers_above_rest_or_after_long_holds_are_tared_again(
     touch: Touch, middle: float, is_lost: bool
 ) -> None:
     assert touch.has_lost_rest(100 * S, middle) == is_lost
@@ -165,8 +165,8 @@ def test_a_finger_touching_alone_for_30_s_is_tared_again() -> None:
 
 
 @pytest.mark.parametrize(("by", "touches"), [(20, True), (19, False)])
-def test_the_depth_of_a_hold_fades_in_seconds(by: int, touches: bool) -> None:
-    """By 5 counts/s: 100 counts are 80 after 4 s, of which a quarter holds."""
+def test_the_depth_of_a_hold_fades_5_counts_a_second(by: int, touches: bool) -> None:
+    """100 counts are 80 after 4 s; the touch lasts above a quarter of that."""
     contact, rest = rested()
     for at_s, fall in ((1, 100), (5, 60), (5, by)):
         counts = pressed(rest, fall)
@@ -290,8 +290,8 @@ NOISE = 3.5
 PRESSED = np.where(np.arange(24) % 3 == 0, 1.0, 0.2)
 """Share of a touch's depth that each electrode feels: eight all of it, the others a fifth."""
 SLOPES = np.random.default_rng(5).normal(0.0, 0.2, (3, 24))
-"""Counts/s by which the electrodes of a finger drift apart: 0.13 to 0.22 (standard deviation, over
-the real recording of untouched sensors)."""
+"""Drift of each electrode, counts/s. The standard deviation over a finger is 0.13 to 0.22 in the
+real recording of untouched sensors."""
 
 
 class Hand:

@@ -244,7 +244,7 @@ def test_repeating_the_same_palm_packets_is_never_stable(packets: int) -> None:
 def test_twenty_equal_or_unread_electrodes_make_a_repeated_sweep(
     equal: int, unread: int, is_frozen: bool, since: int
 ) -> None:
-    """Unread from sweep `since` on."""
+    """From sweep `since` on, `unread` electrodes of the finger are flagged."""
     health, random = Health(len(FINGERS)), np.random.default_rng(4)
     sweeps = random.integers(500, 3500, (9, 3, 24))
     sweeps[8, 1] = sweeps[2, 1]

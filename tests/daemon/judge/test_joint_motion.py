@@ -202,7 +202,7 @@ def test_joints_are_judged_alike_however_messages_group_them(sends: str) -> None
 
 @pytest.mark.parametrize(("rad_per_s", "reason"), [(0.0, None), (0.105, Reason.MOVING)])
 @pytest.mark.parametrize("valid_every_ms", [20, 100, 140])
-def test_a_joint_that_is_sometimes_null_is_judged_by_its_other_angles(
+def test_a_joint_sometimes_null_is_judged_by_its_valid_angles(
     rad_per_s: float, reason: Reason | None, valid_every_ms: int
 ) -> None:
     motion = JointMotion()

@@ -74,7 +74,7 @@ def test_motion_is_unknown_until_noise_is_known_and_after_gaps() -> None:
     assert not np.isfinite(moves(motion)).any()
 
 
-def test_the_echo_of_noise_in_windows_is_that_of_a_ramp() -> None:
+def test_the_echo_tables_equal_their_closed_forms_at_lag_one() -> None:
     """Closed forms of the sums, for neighbours in a window of n steps."""
     n = np.arange(3, STEPS + 1)
     np.testing.assert_allclose(SLOPE_ECHO[3:, 0], 1.0 - 3.0 / n, atol=1e-12)
@@ -134,7 +134,7 @@ def test_memory_is_bounded_however_fast_readings_come() -> None:
     assert ring.first + len(ring.times_ns) <= len(ring.steps)
 
 
-def test_the_noise_of_an_electrode_counts_until_it_is_lost() -> None:
+def test_noise_measured_before_an_electrode_is_lost_still_counts() -> None:
     motion, all_but_one = Motion(1, 0.05), np.ones((1, 24), dtype=np.bool_)
     all_but_one[0, 0] = False
     sweep = np.full((1, 24), 2000, dtype=np.uint16)
