@@ -68,7 +68,7 @@ class Stillness:
         """Update `lasts_ns` for the reading of `t_ns`.
 
         `disturbed`: something moves or forbids settling, so counting starts again. `is_sure`: slow
-        slides are excluded. Stillness counts back by the window's length, at most to the touch.
+        slides are excluded. Counting begins a window's length back, but not before the touch.
         """
         if disturbed:
             self._since_ns, self.lasts_ns = None, 0
