@@ -330,8 +330,8 @@ class Motion:
     ) -> None:
         """Take in the sweep of `t_ns`, shape (fingers, 24), and which electrodes are usable.
 
-        `usable`: None if all are. `wanted`: False makes the motion unknown from the next step on, to
-        save time. Times must not go back: call `reset` before one that does, and after a gap.
+        `usable`: None if all are. `wanted`: False makes the motion unknown from the next step on,
+        to save time. Times must not go back: call `reset` before one that does, and after a gap.
         """
         ring, sweep = self.ring, counts.astype(np.float32)
         if ring.last_ns is None:
