@@ -8,9 +8,10 @@
 //     if (const auto answer = client.may_i_lift(0.5))
 //         client.tell(answer.verdict, lift() ? graspd::Outcome::held : graspd::Outcome::slipped);
 //
-// Nothing here runs by itself but ZeroMQ's own thread, and an object belongs to the thread that
-// made it. Only `verdict(wait_s)`, `may_i_lift(deadline_s)`, `wait_for_grasp(deadline_s)`,
-// `wait_for_slide(timeout_s)` and `tell(..., wait_s)` wait, and no longer than told.
+// Only ZeroMQ's own thread runs in the background. Use an object only in the thread that made it.
+// Only `verdict(wait_s)`, `may_i_lift(deadline_s)`, `wait_for_grasp(deadline_s)`,
+// `wait_for_slide(timeout_s)` and `tell(..., wait_s)` wait, at most for the given time, and the
+// destructor, at most 0.2 s.
 #pragma once
 
 #include <algorithm>
@@ -108,9 +109,9 @@ struct Risk {
     std::optional<double> target;  // share of slips that is allowed; none: no risk is set
     std::int64_t lifts = 0, slips = 0;
     std::int64_t outstanding = 0;  // outcomes that can still come
-    std::optional<double> bound;   // upper bound of `slips`; each outstanding lift adds one
+    std::optional<double> bound;   // upper bound of `slips`; each outstanding lift may add one
     std::int64_t warm_up_left = 0;  // outcomes until most grasps need no supervision
-    std::int64_t announced = 0;     // `lift` questions that were answered `stable`
+    std::int64_t announced = 0;     // grasps answered `stable` to `lift`, less those taken back
     std::int64_t awaited = 0;  // announced lifts without an outcome; too many forbid `stable`
 };
 
@@ -227,8 +228,8 @@ struct Options {
     double max_age_ms = 100.0;  // largest age of a reading that permits a lift
     // `[ask]`: socket at which `may_i_lift` asks for a judgement and `tell` reports.
     std::string ask_endpoint = {};
-    // True if the daemon's monotonic clock is also the client's. None: true for ipc:// and loopback
-    // addresses, so pass false for a tunnel.
+    // True if the daemon's monotonic clock is also the client's. Empty: true for ipc:// and
+    // loopback addresses, so pass false for a tunnel.
     std::optional<bool> same_computer = {};
     std::optional<Keys> keys = {};
     // A `stable` with this `p_slip` or more counts as unknown. Pass the scene's `slip_threshold` if
@@ -510,7 +511,7 @@ public:
     // Each finger with each state that it had in the messages of the last look.
     std::set<std::pair<std::string, FingerState>> passed;
     Counts counts;
-    bool may_be_announced = false;  // the lift that the last answer was about
+    bool may_be_announced = false;  // whether the last answer may have announced a lift
 
     // Longest silence before the grasp is unknown, ns; 0 without a message.
     Nanoseconds silence_ns() const { return message_ ? message_->silence_ns : 0; }
@@ -583,7 +584,8 @@ public:
         if (ended_.size() > LIFTS_MAX) ended_.pop_front();
     }
 
-    // Parses an answer to `lift`, and notes if its lift may be announced; none if not understood.
+    // Parses an answer to `lift`, and sets `may_be_announced`; none if not understood. A verdict on
+    // a grasp whose outcome was reported becomes unknown.
     std::optional<Verdict> answered(std::string_view payload) {
         auto found = read(payload, max_p_slip_).first;
         may_be_announced = !found || found->verdict.decision == Decision::stable ||
@@ -673,8 +675,9 @@ private:
     std::int64_t seq_ = -1;
     std::deque<std::string> former_;
     std::deque<Key> ended_;  // grasps whose outcome was reported, the oldest first
-    std::optional<std::pair<Nanoseconds, Nanoseconds>> best_;  // of the clocks, and when
-    Nanoseconds least_ns_ = 0;  // of these differences
+    // Smallest difference of arrival and publication, given the drift since, and its time, ns.
+    std::optional<std::pair<Nanoseconds, Nanoseconds>> best_;
+    Nanoseconds least_ns_ = 0;  // smallest of these differences ever, whatever the drift
     // Lower bound of the clocks' difference by the daemon's answer, and its time, ns.
     std::optional<std::pair<Nanoseconds, Nanoseconds>> bound_;
 };
@@ -744,7 +747,8 @@ public:
             [&] { return call.socket.send(zmq::buffer(question), zmq::send_flags::dontwait); });
     }
 
-    // Report that no lift follows the question; its socket closes when that is sent.
+    // Report that no lift follows the question. Its socket stays open, so that this is sent; beyond
+    // `LEAVING_MAX` the oldest closes, even if its message was not sent.
     void take_back(Call& call) {
         if (!call.socket) return;
         call.socket.set(zmq::sockopt::linger, TAKE_BACK_MS);
@@ -898,7 +902,7 @@ public:
 
 private:
     // Returns the newest verdict as unknown, with the reasons and the owner of the answer that
-    // refused its grasp; without one for `no-answer`.
+    // refused its grasp; without such an answer for its own reasons, or else `no-answer`.
     Verdict refused(Verdict newest) const {
         std::vector<std::string> why = newest.reasons;
         if (refusal_ && key(*refusal_) == key(newest)) {
@@ -931,8 +935,8 @@ private:
 // Subscribes to the verdicts of one hand. Use it in one thread.
 class Client {
 public:
-    // Throws `zmq::error_t` for a wrong endpoint, `std::invalid_argument` for an invalid age or
-    // probability.
+    // Throws `zmq::error_t` for a wrong endpoint (a wrong `ask_endpoint` throws only at the first
+    // question), `std::invalid_argument` for an invalid age or probability.
     explicit Client(const Options& options)
         : newest_("verdict." + options.hand, age_ns(options.max_age_ms),
                   options.same_computer.value_or(detail::is_same_computer(options.endpoint)),
@@ -953,7 +957,8 @@ public:
         return found;
     }
 
-    // Returns the newest verdict; waits at most `wait_s` seconds for a new message.
+    // Returns the newest verdict; waits at most `wait_s` seconds for a new message. Throws
+    // `std::invalid_argument` for an invalid time.
     Verdict verdict(double wait_s = 0.0) {
         return next_verdict(detail::now_ns() + duration_ns(wait_s));
     }
@@ -1059,8 +1064,8 @@ public:
     //
     // Waits at most `wait_s` seconds: graspd answers once the outcome is on its disk. Later calls
     // take in a late answer; without one, report again. Throws `std::invalid_argument` without an
-    // ask endpoint, for a verdict without a grasp, and for a name that is not 1 to 64 letters
-    // (ASCII), digits, `_`, `-`, `.`, or that begins with one of the last two.
+    // ask endpoint, for a verdict without a grasp, for an invalid time, and for a name that is not
+    // 1 to 64 letters (ASCII), digits, `_`, `-`, `.`, or that begins with one of the last two.
     OutcomeAnswer tell(const Verdict& lifted_on, Outcome how,
                        const std::string& object_name = {}, double wait_s = 2.0) {
         const std::string telling = detail::telling(lifted_on, how, object_name);

@@ -9,8 +9,8 @@ messages are those of deploy/wire/README.md, version 1.
 
 Only ZeroMQ's own thread runs in the background. Use an object only in the thread that made
 it. Only `verdict(wait_s)`, `may_i_lift(deadline_s)`, `wait_for_grasp(deadline_s)`,
-`wait_for_slide(timeout_s)` and `tell(..., wait_s)` wait, at most for the given time.
-`AsyncClient` has the same for asyncio.
+`wait_for_slide(timeout_s)` and `tell(..., wait_s)` wait, at most for the given time, and `close`,
+at most 0.2 s. `AsyncClient` has the same for asyncio.
 """
 
 from __future__ import annotations
@@ -143,9 +143,9 @@ class Risk:
     lifts: int
     slips: int
     outstanding: int  # outcomes that can still come
-    bound: float | None  # upper bound of `slips`; each outstanding lift adds one
+    bound: float | None  # upper bound of `slips`; each outstanding lift may add one
     warm_up_left: int  # outcomes missing until most grasps need no supervision
-    announced: int = 0  # `lift` questions that were answered `stable`
+    announced: int = 0  # grasps answered `stable` to `lift`, less those taken back
     awaited: int = 0  # announced lifts without an outcome; too many forbid `stable`
 
 
@@ -290,8 +290,9 @@ class _Hand:
         reports. `same_computer`: True if the daemon's monotonic clock is also the client's. None:
         True for `ipc://` and loopback addresses, so pass False for a tunnel. `max_p_slip`: a
         `stable` with this `p_slip` or more counts as unknown; pass the scene's `slip_threshold` if
-        it is above 0.5. `keys`: None for no encryption. Raises `zmq.ZMQError` for a wrong endpoint,
-        `TypeError` for one that is not text, and `ValueError` for an invalid age or probability.
+        it is above 0.5. `keys`: None for no encryption. Raises `zmq.ZMQError` for a wrong endpoint
+        (a wrong `ask_endpoint` raises only at the first question), `TypeError` for one that is not
+        text, and `ValueError` for an invalid age or probability.
         """
         for name, text in (("endpoint", endpoint), ("hand", hand), ("ask_endpoint", ask_endpoint)):
             if not isinstance(text, str) and (name, text) != ("ask_endpoint", None):
@@ -440,7 +441,8 @@ class _Hand:
     def close(self) -> None:
         """Close the sockets. May be called again; every verdict is unknown from then on.
 
-        A running call in another thread or task ends soon and closes them.
+        A running call in another task ends at once and closes them, one in another thread at its
+        next message, or without one after up to 10 s.
         """
         if not self._closed and os.getpid() == self._pid:
             self._closed = True
@@ -669,7 +671,8 @@ class Client(_Hand):
 class AsyncClient(_Hand):
     """`Client` for asyncio: the same rules, with methods to await where `Client` waits.
 
-    A call sleeps until a socket wakes the loop, and may be cancelled.
+    A call sleeps until a socket wakes the loop, and may be cancelled. A second call meanwhile
+    raises `RuntimeError`.
     """
 
     _woken: Any = None  # future of the waiting task
@@ -785,9 +788,10 @@ class Newest:
         self._ended: dict[tuple[str, int], None] = {}
         """Grasps whose outcome was reported, the oldest first, at most `LIFTS_MAX`."""
         self._best: tuple[int, int] | None = None
-        """Smallest difference of arrival and publication so far, and its time, ns; None: none."""
+        """Smallest difference of arrival and publication, given the drift since, and its time, ns;
+        None: none."""
         self._least_ns = 0
-        """Smallest of all these differences, ns."""
+        """Smallest of these differences ever, whatever the drift, ns."""
         self._bound: tuple[int, int] | None = None
         """Lower bound of the clocks' difference by the daemon's answer, and its time, ns."""
 
@@ -1014,7 +1018,7 @@ class _Question:
 
     def _refused(self, newest: Verdict) -> Verdict:
         """Return the newest verdict as unknown, with the reasons and the owner of the answer that
-        refused its grasp; without one for `no-answer`."""
+        refused its grasp; without such an answer for its own reasons, or else `no-answer`."""
         refusal = self._refusal
         if refusal is None or _key(refusal) != _key(newest):
             return newest.unknown(*(newest.reasons or ("no-answer",)))
@@ -1081,7 +1085,8 @@ class _Link:
         self._socket = self.connected(zmq.SUB, self._endpoint)
 
     def leave(self, socket: zmq.Socket[bytes]) -> None:
-        """Keep a socket open until its last message is sent; close the oldest if there are many."""
+        """Keep a socket open, so that its last message is sent. Beyond `LEAVING_MAX` close the
+        oldest, even if its message was not."""
         self._leaving.append(socket)
         if len(self._leaving) > LEAVING_MAX:
             self._leaving.popleft().close(0)
@@ -1158,7 +1163,8 @@ class _Call:
 
 
 def is_same_computer(endpoint: str) -> bool:
-    """Return True if an endpoint can only be on this computer."""
+    """Return True for an `ipc://` or loopback endpoint, which only a tunnel makes another
+    computer's."""
     return endpoint.startswith(("ipc://", "tcp://127.", "tcp://[::1]", "tcp://localhost:"))
 
 
@@ -1300,7 +1306,7 @@ def _telling(lifted_on: Verdict, how: Outcome, object_name: str | None) -> bytes
 
 
 def _key(lifted_on: Verdict) -> tuple[str, int]:
-    """Return `boot_id` and number of the verdict's grasp; ("", 0) without one."""
+    """Return `boot_id` and number of the verdict's grasp; "" or 0 in place of None."""
     return lifted_on.boot_id or "", lifted_on.grasp or 0
 
 
