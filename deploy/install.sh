@@ -115,7 +115,7 @@ find_root() {
     esac
 }
 
-# Prints --prefix, or the folder where graspd is installed, or /opt/graspd.
+# Sets prefix to that of --prefix, else where graspd is installed, else /opt/graspd.
 find_prefix() {
     there=''
     if [ -L "$root$command_link" ]; then
@@ -136,7 +136,8 @@ find_prefix() {
     fi
 }
 
-# Only root may write at the prefix and in the folders above it, for root runs it.
+# Fails if others than root (with --root: or its caller) may write at the prefix or above it, for
+# root runs what is there.
 check_prefix() {
     resolved=$(realpath -m -- "$root$prefix")
     case $resolved in
@@ -170,7 +171,7 @@ check_folder() {
     esac
 }
 
-# Extras of --extras, or those installed: an update must not take the recorder away.
+# Sets extras to --extras, else those installed: an update must not take the recorder away.
 find_extras() {
     case $extras in
         -) extras='' ;;
@@ -207,7 +208,8 @@ check_host() {
     [ -z "$wheelhouse" ] || check_wheelhouse
 }
 
-# pip only warns of a part that graspd does not have; so it stays with wheels alone.
+# Fails for a part that graspd does not have, of which pip only warns; with wheels alone, without
+# the source, that warning has to do.
 check_extras() {
     [ -f "$source/pyproject.toml" ] || return 0
     "$python" -I - "$source/pyproject.toml" >"$scratch/extras" <<'END'
@@ -229,7 +231,7 @@ check_wheelhouse() {
     wheelhouse=$(cd -- "$wheelhouse" && pwd)
     set -- "$wheelhouse"/graspd-*.whl
     [ -f "$1" ] || fail "$wheelhouse has no wheel of graspd: pip wheel -w $wheelhouse $source"
-    # pip would take the highest, also where a lower one was made to go back to.
+    # pip would take the highest, even if a lower one was added to go back to it.
     [ $# = 1 ] || fail "$wheelhouse has several wheels of graspd: leave the one to install"
 }
 
@@ -265,7 +267,7 @@ did() {
     changed="$changed $*"
 }
 
-# put FILE DESTINATION: copies what differs, with the prefix in its place.
+# put FILE DESTINATION: copies a file that differs, with the prefix in place of /opt/graspd.
 put() {
     sed "s|/opt/graspd|$prefix|g" "$here/$1" >"$scratch/file"
     if cmp -s "$scratch/file" "$root$2"; then return; fi
@@ -305,13 +307,13 @@ environment() {
     esac
 }
 
-# The first line of graspd --version, such as "graspd 0.1.0".
+# Prints the first line of graspd --version, such as "graspd 0.1.0"; fails if it does not start.
 version_of() {
     "$1/bin/python" -I -m graspd --version >"$scratch/version" || return 1
     sed -n 1p "$scratch/version"
 }
 
-# All that the environment is made of: while this is the same, so is the environment.
+# Prints all that the environment is made of: while this is the same, so is the environment.
 inputs() {
     "$python" -I -c 'import sys; print(sys.executable, sys.version)'
     printf '%s\n' "$extras"
@@ -351,7 +353,7 @@ settle() {
     "$new/bin/python" -I -m compileall -qq -j 0 "$@" "$new/lib" || true
 }
 
-# Former environments, except those that a running graspd still uses.
+# Removes former environments, except those that a running graspd still uses.
 sweep() {
     current=$(readlink -- "$root$prefix/venv")
     for former in "$root$prefix"/venv-*; do

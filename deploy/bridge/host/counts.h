@@ -28,7 +28,8 @@ bool counts_open(struct counts *counts, const char *path, unsigned sensors);
 
 /* Make `row` the current row: the pattern's, else the next line; row 0 begins a file again. A line
  * has sensors * 24 numbers 0..4095, sensor by sensor, apart by spaces or commas; lines that begin
- * with # are skipped. */
+ * with # are skipped. A file begins again at its end, a stream then gives COUNTS_END; a bad line
+ * gives COUNTS_BAD. The present row once more changes nothing. */
 enum counts_result counts_take(struct counts *counts, uint32_t row);
 
 void counts_close(struct counts *counts);

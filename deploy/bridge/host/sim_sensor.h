@@ -40,7 +40,7 @@ void sim_sensor_init(struct sim_sensor *sensor, unsigned number);
 /* Chip select, active low: `selected` is true when it is pulled low. */
 void sim_sensor_select(struct sim_sensor *sensor, bool selected, uint64_t now_ns);
 
-/* One byte while selected; `now_ns` is when its first bit is clocked. */
+/* Take one byte while selected, give the one on MISO; `now_ns`: when the first bit is clocked. */
 uint8_t sim_sensor_transfer(struct sim_sensor *sensor, uint8_t mosi, uint64_t now_ns);
 
 #endif

@@ -38,8 +38,9 @@ enum biotac_sequence {
 bool biotac_odd_parity(uint8_t byte);
 
 /* First command byte that samples a channel: `1 CCCCCC P`, odd parity (manual figure 13).
- * 0 for what a BioTac SP does not have. Channel 16 is none: its byte 0xA1 starts the streaming loop
- * of the old protocol V1.1, which a sensor leaves only after five seconds of idle clock. */
+ * 0 for channels other than PAC, PDC, TAC, TDC and E1..E24, above all for 16: its byte 0xA1 starts
+ * the streaming loop of the old protocol V1.1, which a sensor leaves only after five seconds of
+ * idle clock. */
 uint8_t biotac_sample_command(uint8_t channel);
 
 /* True if the byte is one that biotac_sample_command gives. */

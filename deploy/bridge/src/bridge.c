@@ -202,8 +202,8 @@ static uint8_t sample(struct bridge *bridge, uint8_t command, uint8_t *word)
     return sound;
 }
 
-/* Set when the next sweep is due, and count an overrun. Sweeps keep their grid: after a late one
- * the next is due at the next whole period, never in a burst. */
+/* Set when the next sweep is due; count an overrun if the one that begins is late. Sweeps keep
+ * their grid: after a late one the next is due at the next whole period, never in a burst. */
 static void schedule_next(struct bridge *bridge, uint64_t now_us)
 {
     const uint32_t period_us = bridge->config.period_us;

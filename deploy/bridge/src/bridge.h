@@ -61,7 +61,7 @@ bool bridge_init(struct bridge *bridge, const struct bridge_config *config);
  * without end. */
 void bridge_poll(struct bridge *bridge);
 
-/* Time, in ticks, at which bridge_poll has something to do even if no byte moves. */
+/* Time (hal_ticks_us) at which bridge_poll has something to do even if no byte moves. */
 uint64_t bridge_due_us(const struct bridge *bridge);
 
 #ifdef __cplusplus

@@ -259,7 +259,7 @@ static void a_sweep_takes_1_9_ms_at_4_4_mhz(void)
     CHECK(took >= 1900 && took <= 1920);
 }
 
-static void words_are_what_the_sensors_feel(void)
+static void words_carry_the_counts_of_each_sensor(void)
 {
     uint8_t frame[1024], slot, i;
     size_t size = 0;
@@ -506,7 +506,7 @@ static const struct {
 } tests[] = {
     TEST(a_slot_follows_figure_14),
     TEST(a_sweep_takes_1_9_ms_at_4_4_mhz),
-    TEST(words_are_what_the_sensors_feel),
+    TEST(words_carry_the_counts_of_each_sensor),
     TEST(a_hello_comes_after_reset_and_with_every_ping),
     TEST(a_sensor_is_present_if_its_serial_number_starts_with_bt),
     TEST(a_sensor_that_comes_back_is_found_within_a_second_of_sweeping),
