@@ -1,4 +1,4 @@
-"""A real daemon for the clients' tests, whose hand holds an object until the test ends."""
+"""A real daemon for the clients' tests, which plays a recording again and again."""
 
 from __future__ import annotations
 
@@ -70,7 +70,8 @@ class Daemon:
 
 
 def _one_grasp(path: Path) -> Path:
-    """Write a recording of only one grasp, which is stable, so that no test waits for one."""
+    """Write a recording of only one grasp, which is stable, so that no test waits for one; return
+    `path`."""
     head, *rows = DEMO_RECORDING.read_text().splitlines()
     kept = [row.partition(",")[2] for row in rows[REST] + rows[GRASP]]
     lines = [f"{number / RATE_HZ},{row}" for number, row in enumerate(kept)]

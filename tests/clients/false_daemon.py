@@ -48,8 +48,9 @@ def false_daemon(
     """Publish verdicts of `outcome`, with fields `more`, during the block, and answer `lift`.
 
     `messages_each` in `more`: messages on each grasp, else all are on one. `answer` None: with what
-    was published. Frames `taken` answer an outcome. `endpoint`: where to publish; None: at `out` in
-    `folder`. Yields the list of questions and outcomes received so far.
+    was published. Frames `taken` answer an outcome and `not-lifting`. Without frames no answer is
+    sent. `endpoint`: where to publish; None: at `out` in `folder`. Yields the list of what was
+    received so far: `lift`, `not-lifting` and outcomes.
     """
     heard: list[bytes] = []
     out = endpoint or f"ipc://{folder}/out"

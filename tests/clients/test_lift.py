@@ -99,7 +99,8 @@ def test_truthy_values_other_than_true_allow_no_supervised_lift(not_true: object
 
 
 def grasps(number: int) -> World:
-    """Make a world with this number of grasps, each stable for 10 ms, and answers to `lift`."""
+    """Make a world with this number of grasps, each stable for 10 ms, and answers to `lift` and to
+    outcomes."""
     sent = coming(*(("stable", {"grasp": grasp}) for grasp in range(1, number + 1)))
     answers = [(0, message[1]) for _, message in sent for _ in range(2)]
     return World(sent, answers, [(MS, TAKEN)] * number)
@@ -209,7 +210,7 @@ def test_an_answered_client_asks_the_clock_once_a_second() -> None:
     assert asked_at_ms(world) == pytest.approx(list(range(0, 12_000, 1000)), abs=200)
 
 
-def test_an_unanswered_client_asks_again_after_ten_seconds() -> None:
+def test_an_unanswered_clock_question_is_repeated_after_ten_seconds() -> None:
     assert asked_at_ms(heard()) == [0, 10_000]
 
 
@@ -248,7 +249,7 @@ def test_a_question_to_a_peer_that_refuses_raises_nothing(tmp_path: Path) -> Non
         assert call.socket is not None, "the next question has a new socket"
 
 
-def test_a_call_whose_end_fails_lets_the_next_begin() -> None:
+def test_a_call_whose_cleanup_fails_allows_the_next() -> None:
     def interrupted(timeout_ms: int) -> None:
         raise KeyboardInterrupt
 

@@ -127,7 +127,7 @@ def test_lifts_without_an_outcome_are_counted_and_warned_of(
 @pytest.mark.parametrize(
     ("typed", "told"), [("held", "stable"), ("mist\nslipped", "slip"), ("", "not-lifted")]
 )
-def test_lift_gate_tells_its_lift_whatever_is_typed(
+def test_lift_gate_reports_the_typed_outcome_or_not_lifted(
     lift_gate: Path, tmp_path: Path, typed: str, told: str
 ) -> None:
     with false_daemon(tmp_path) as heard:

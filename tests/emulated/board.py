@@ -154,7 +154,7 @@ class Board:
         return found
 
     def until(self, kind: int, count: int, within_ms: float) -> list[bytes]:
-        """Run until `count` frames of a type have come; return their payloads.
+        """Run until `count` frames of a type have come; return their payloads, and drop more.
 
         Fails if that takes longer than `within_ms` of emulated time.
         """

@@ -18,7 +18,7 @@ STEP_MS = 25
 def turns(board: Board, ms: int) -> list[tuple[bool, int]]:
     """Run the board for `ms`; return each on (True) or off time of its light, ms.
 
-    The first and last, which are cut off, are left out.
+    The first and last, which are cut off, are left out, unless the light never changed.
     """
     seen = []
     for _ in range(ms // STEP_MS):

@@ -186,7 +186,8 @@ class Lab:
         )
 
     def twin(self) -> None:
-        """Start a simulated CAN board on vcan0 that plays a recording: making grasps is slower."""
+        """Start a simulated CAN board on vcan0. It plays a recording, which takes less than making
+        grasps."""
         self.sh(
             "systemd-run -q --unit=twin-can /usr/local/bin/graspd twin can "
             f"--interface socketcan --channel vcan0 --rate {RATE_HZ} "

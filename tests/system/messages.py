@@ -27,7 +27,7 @@ class Message:
     t_s: float
     """Time of arrival, s, by the emulated machine's monotonic clock."""
     kind: str
-    """`verdict`, `gate` or `status`."""
+    """Topic without the hand, such as `verdict`, `gate`, `status`."""
     hand: str
     body: dict[str, Any]
 
@@ -38,7 +38,7 @@ class Message:
 
     @property
     def told(self) -> bool:
-        """True for a verdict on a reading, False for one that no reading came, and other kinds."""
+        """True for a verdict on a reading; False for one that none came, and for other kinds."""
         return self.kind == "verdict" and self.body["still_ms"] is not None
 
 

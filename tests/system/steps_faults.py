@@ -163,7 +163,8 @@ def _recording(message: Message) -> bool:
 
 
 def clock_stepped(lab: Lab) -> Outcome:
-    """Step the wall clock by a day and back: no verdict is stale or lost, and no hand warns."""
+    """Step the wall clock by a day and back, twice: no verdict is stale or lost, and no hand warns
+    each time."""
     compared = 0
     warned: Counter[tuple[str, str]] = Counter()
     for sign in STEPS:

@@ -44,8 +44,8 @@ const wire = {
     bytesOfSelection = 0;
     record(SELECT, mask, 0, 0, ns);
   },
-  // Before a byte is clocked: the first command of a sequence begins a sweep, and the sensors feel
-  // what stands in the next row.
+  // Before a byte is clocked: the first command of a sequence begins a sweep, and the sensors get the
+  // counts of the next row.
   begin(mosi, selected) {
     if (bytesOfSelection++ > 0 || !selected || !(mosi & 0x80)) return;
     if (firstCommand < 0) firstCommand = mosi;
@@ -71,7 +71,7 @@ function start(before) {
 }
 
 const commands = {
-  // Power comes, with this image in the flash; what the sensors feel begins anew.
+  // Power comes, with this image in the flash; the sensors' counts begin again.
   power({ file }) {
     image = fs.readFileSync(file);
     sensors.init('');
