@@ -79,7 +79,9 @@ def told(cpp: Probe | None, messages: list[list[bytes]], ended: Grasps = ()) -> 
 
 
 @pytest.mark.parametrize("case", CASES, ids=[case["name"] for case in CASES])
-def test_no_bad_message_or_ended_grasp_allows_a_lift(cpp: Probe | None, case: dict[str, Any]) -> None:
+def test_no_bad_message_or_ended_grasp_allows_a_lift(
+    cpp: Probe | None, case: dict[str, Any]
+) -> None:
     found = told(cpp, came(case, START_NS), case.get("told", ()))
     assert not found
     assert not found.supervised
