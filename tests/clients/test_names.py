@@ -1,4 +1,4 @@
-"""Both clients have the same names and bounds."""
+"""Both clients have the same names and constants."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_the_cpp_client_has_the_python_clients_names() -> None:
         assert names - set(re.findall(r"\w+", body(kind))) == set(), kind
 
 
-def test_both_clients_have_the_same_bounds() -> None:
+def test_both_clients_have_the_same_constants() -> None:
     python = {
         name: value
         for name, value in vars(graspd_client).items()

@@ -39,7 +39,7 @@ ANSWERS: dict[str, tuple[list[bytes], str]] = {
 
 
 @pytest.mark.parametrize(("frames", "why"), ANSWERS.values(), ids=ANSWERS)
-def test_an_outcome_is_taken_only_if_the_answer_says_so(
+def test_an_outcome_is_accepted_only_if_the_answer_says_so(
     connect: Connect, tmp_path: Path, frames: Sequence[bytes], why: str
 ) -> None:
     with false_daemon(tmp_path, taken=frames) as heard:
@@ -49,7 +49,7 @@ def test_an_outcome_is_taken_only_if_the_answer_says_so(
 
 
 @pytest.mark.parametrize("name", [None, "035_power-drill", "_Z.a-9", "x" * 64])
-def test_an_outcome_has_the_object_as_it_was_given(
+def test_an_outcome_carries_the_objects_name_unchanged(
     connect: Connect, tmp_path: Path, name: str | None
 ) -> None:
     with false_daemon(tmp_path) as heard:

@@ -131,7 +131,7 @@ static void take_outage(struct options *options, const char *text)
     outage->until = *text != '\0' ? number("--unplug", &text, 10, 0, UINT32_MAX) : UINT32_MAX;
 }
 
-/* Options about one sensor: true if `option` is one. */
+/* Take an option about one sensor; false if `option` is another. */
 static bool take_sensor_option(const char *option, const char *value)
 {
     struct sim_sensor *sensor;

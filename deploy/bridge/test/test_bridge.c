@@ -217,7 +217,7 @@ static void set_up(uint8_t number, uint32_t period_us)
 
 /* ---- tests ----------------------------------------------------------------------------------- */
 
-static void a_slot_follows_figure_14(void)
+static void each_slot_has_the_order_and_waits_of_figure_14(void)
 {
     size_t i = 0, slot, read;
 
@@ -504,7 +504,7 @@ static const struct {
     const char *name;
     void (*run)(void);
 } tests[] = {
-    TEST(a_slot_follows_figure_14),
+    TEST(each_slot_has_the_order_and_waits_of_figure_14),
     TEST(a_sweep_takes_1_9_ms_at_4_4_mhz),
     TEST(words_carry_the_counts_of_each_sensor),
     TEST(a_hello_comes_after_reset_and_with_every_ping),

@@ -65,14 +65,15 @@ QUIET_NS, QUIET_MAX_NS = 1_000_000_000, 10_000_000_000
 # The computer has slept if its two clocks differ by more. A sleep takes seconds, the
 # scheduler a moment between two looks at the clocks.
 SLEPT_NS = 50_000_000
-# Longest wait in one piece while the clock of another computer is not known: so well is it known
-# when a message came.
+# Longest wait in one piece while the clock of another computer is not known, and so the error of
+# the time when its message came.
 SLICE_MS = 10
 # Most by which a message's time may be in the future while the clocks count as the same.
 CLOCK_SLACK_NS = 1_000_000
 # Largest drift between two computers' clocks: NTP slews by 5e-4, a bad crystal is off by 1e-4.
 DRIFT = 1e-3
-# Largest total drift. A delay that grows as slowly looks the same.
+# Largest total drift while the daemon's clock is not known; beyond it verdicts are unknown. A delay
+# that grows as slowly looks the same.
 DRIFT_MAX_NS = 20_000_000
 # Time between two questions for the daemon's clock, and after one that was not answered.
 CLOCK_EVERY_NS, CLOCK_RETRY_NS = 1_000_000_000, 10_000_000_000
