@@ -67,8 +67,8 @@ constexpr std::int64_t SLICE_MS = 10;
 constexpr Nanoseconds CLOCK_SLACK_NS = 1'000'000;
 // Largest drift between two computers' clocks: NTP slews by 5e-4, a bad crystal is off by 1e-4.
 constexpr double DRIFT = 1e-3;
-// Largest total drift while the daemon's clock is not known; beyond it verdicts are unknown. A delay
-// that grows as slowly looks the same.
+// Largest total drift while the daemon's clock is not known; beyond it verdicts are unknown. A
+// delay that grows as slowly looks the same.
 constexpr Nanoseconds DRIFT_MAX_NS = 20'000'000;
 // Time between two questions for the daemon's clock, and after one that was not answered.
 constexpr Nanoseconds CLOCK_EVERY_NS = 1'000'000'000, CLOCK_RETRY_NS = 10'000'000'000;
@@ -79,8 +79,8 @@ constexpr std::size_t OBJECT_MAX = 64;  // characters of an object's name
 constexpr std::size_t NAME_BYTES = 16;   // of a client's name
 constexpr std::size_t LIFTS_MAX = 256;  // lifts that are remembered, as in graspd
 constexpr std::int64_t WARN_EVERY = 10;  // unreported lifts for each warning
-// Longest wait in the destructor until graspd has received that no lift follows, and most connections
-// that say so at a time.
+// Longest wait in the destructor until graspd has received that no lift follows, and most
+// connections that say so at a time.
 constexpr int TAKE_BACK_MS = 200;
 constexpr std::size_t LEAVING_MAX = 4;
 
@@ -951,7 +951,7 @@ public:
     const Counts& counts() const { return newest_.counts; }
 
     // Number of lifts, before the last allowed one, of which graspd has no outcome; it cannot
-    // learn from those. With `[risk]` one that was asked for and is never reported counts as a slip.
+    // learn from them. With `[risk]` one that was asked for and is never reported counts as a slip.
     std::int64_t unreported() const {
         std::int64_t found = forgotten_;
         for (const auto& [grasp, told] : lifts_) found += !told && grasp != last_;
