@@ -123,14 +123,14 @@ struct Verdict {
     std::vector<std::string> reasons;
     std::optional<double> p_slip;        // probability of slip; none when unknown
     std::optional<std::int64_t> grasp;   // number of the contact episode
-    std::optional<std::int64_t> seq;
-    std::string boot_id;                 // empty before the first message
+    std::optional<std::int64_t> seq;     // number of the message since the daemon's start
+    std::string boot_id;                 // names that start; empty before the first message
     // Time since the reading's last byte; from another computer estimated.
     std::optional<double> age_ms;
     std::optional<double> p_slip_model;  // `p_slip` by the model alone
     std::int64_t outcomes = 0;           // number of outcomes that `p_slip` rests on
     bool supervised = false;             // graspd would learn from the lift; a person must watch
-    std::optional<Risk> risk;
+    std::optional<Risk> risk;            // none if graspd neither learns nor has a `[risk]`
     // Judged when nothing moved fast, but something might still slide slowly.
     bool early = false;
     // For how long the hand has been still: from 100 on nothing moves fast, from 240 on nothing

@@ -166,7 +166,9 @@ class Verdict:
     noise; `motion_limits` is the largest motion that counts as still. `fingers` has the state of
     each finger. Each is None if not known; a state is never known from a reading older than
     `max_age_ms`. `owner` is `you` if you report the outcome of the lift, `another` if another
-    controller does, which may be lifting. Fields that no message has given yet are None.
+    controller does, which may be lifting. `boot_id` names the daemon's start, `seq` numbers the
+    messages since. `risk` is None if graspd neither learns nor has a `[risk]`. Fields that no
+    message has given yet are None.
     """
 
     decision: Decision
