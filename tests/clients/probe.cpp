@@ -5,8 +5,9 @@
 // `at NOW_NS` answers with a line.
 //
 // `client ENDPOINT ASK_ENDPOINT MAX_AGE_MS` (`-`: not asked) makes one. Each of its calls answers
-// with a line: `lift DEADLINE_S SUPERVISED STILL_MS` (`-`: none), `wait DEADLINE_S SUPERVISED`,
-// `slide TIMEOUT_S`, `tell WAIT_S BOOT_ID GRASP OUTCOME NAME` (hex). What throws is `refused`.
+// with a line, after a line `warn TEXT` for each warning; one that throws with `refused TEXT`:
+// `lift DEADLINE_S SUPERVISED STILL_MS` (`-`: none), `wait DEADLINE_S SUPERVISED`,
+// `slide TIMEOUT_S`, `tell WAIT_S BOOT_ID GRASP OUTCOME NAME` (hex).
 #include "graspd_client.hpp"
 
 #include <iostream>

@@ -11,7 +11,7 @@
 // Only ZeroMQ's own thread runs in the background. Use an object only in the thread that made it.
 // Only `verdict(wait_s)`, `may_i_lift(deadline_s)`, `wait_for_grasp(deadline_s)`,
 // `wait_for_slide(timeout_s)` and `tell(..., wait_s)` wait, at most for the given time, and the
-// destructor, at most 0.2 s.
+// destructor, for up to 0.2 s.
 #pragma once
 
 #include <algorithm>

@@ -10,7 +10,7 @@ messages are those of deploy/wire/README.md, version 1.
 Only ZeroMQ's own thread runs in the background. Use an object only in the thread that made
 it. Only `verdict(wait_s)`, `may_i_lift(deadline_s)`, `wait_for_grasp(deadline_s)`,
 `wait_for_slide(timeout_s)` and `tell(..., wait_s)` wait, at most for the given time, and `close`,
-at most 0.2 s. `AsyncClient` has the same for asyncio.
+for up to 0.2 s. `AsyncClient` has the same for asyncio.
 """
 
 from __future__ import annotations
