@@ -63,8 +63,8 @@ def fingers_of(names: Sequence[str]) -> tuple[Finger, ...]:
 def write_csv(table: Any, folder: str) -> Path:  # noqa: ANN401
     """Write `table.csv` in a folder, a missing value as an empty cell; return the file's path.
 
-    NUL is left out of text; what UTF-8 does not have becomes `\\udcff`. Raises `ValueError` for a
-    column that occurs twice, is of float16, or differs in length.
+    NUL is left out of text; what UTF-8 cannot encode is escaped, as `\\udcff`. Raises `ValueError`
+    for a column that occurs twice, is of float16, or differs in length.
     """
     names, path = column_names(table), Path(folder, "table.csv")
     columns = [_cells(column, what) for what, column in _columns(table, names, names).items()]

@@ -212,7 +212,8 @@ class _Reader:
 
 
 def _check_trees(lists: Mapping[str, list[int]], width: int) -> None:
-    """Raise `ModelError` unless each node is reached once, from the first of its tree.
+    """Raise `ModelError` unless each node is reached once, from the first of its tree, and each
+    result is one of a leaf.
 
     `lists`: attributes of the operator. `width`: number of values that the trees read.
     """

@@ -33,7 +33,8 @@ BALANCED_FROM = 20
 SHARE_GRASPS = 50.0
 """Number of latest grasps over which the share of slips is averaged."""
 LEAST_WEIGHT = 0.02
-"""Smallest weight of a slip; above zero, so that a session that began wrongly recovers."""
+"""Smallest weight of a grasp that was not judged stable; above zero, so that a session that began
+wrongly recovers."""
 
 SPREAD_RATIOS = (0.2, 3.0)
 """Smallest and largest median spread of a finger's electrodes, in units of the training's.

@@ -123,10 +123,10 @@ class TactileImager(InputBuilder):
     def build(self, counts: NDArray[np.generic], out: NDArray[np.float32]) -> NDArray[np.float64]:
         """Write the image of one reading into `out`; return each finger's spread.
 
-        `counts`: shape (fingers, 24). `out`: shape `self.shape`, C-contiguous. The result, shape
-        (fingers,), is the standard deviation in counts. If it is below `SPREAD_FLOOR_COUNTS` or not
-        finite, the finger's image is all zeros and must not be judged. For counts of 12 bits its
-        relative error is below 1e-9.
+        `counts`: shape (fingers, 24). `out`: shape `self.shape`, C-contiguous, else `ValueError`.
+        The result, shape (fingers,), is the standard deviation in counts. If it is below
+        `SPREAD_FLOOR_COUNTS` or not finite, the finger's image is all zeros and must not be judged.
+        For counts of 12 bits its relative error is below 1e-9.
         """
         if out.shape != self.shape or not out.flags.c_contiguous:
             raise ValueError(f"out must be C-contiguous {self.shape}, is {out.shape}")

@@ -73,9 +73,9 @@ class CanBus:
         self.failure: LinkError | None = None
         """Error that broke the bus; None while it works."""
         self.more = False
-        """True if the last `drain` left frames behind."""
+        """True if the last `drain` returned as many as it may, so that others may wait."""
         self.tap: Callable[[list[Stamped]], None] | None = None
-        """Called with the frames of each `drain` that returns some."""
+        """Function called with the frames of each `drain` that returns some; None: none."""
         self.counters = CanCounters()
         self._interface = interface
         self._channel = channel
@@ -210,7 +210,7 @@ class CanBus:
                 frames.append((frame, *self._arrived(message.timestamp, since_ns)))
 
     def _is_empty(self) -> bool:
-        """Return True if the descriptor, if there is one, has nothing to read."""
+        """Return True if there is a descriptor, and it has nothing to read."""
         return self.descriptor is not None and not is_ready(self.descriptor)
 
     def _in_order(self, stamp_ns: int, now_ns: int) -> int:

@@ -99,7 +99,7 @@ class CanCounters(DriverCounters):
     accepted_frames: int = 0
     """Samples of the configured sensors, duplicates included."""
     foreign_frames: int = 0
-    """Frames with another arbitration id. While the id is unknown: frames without counts."""
+    """Frames with another arbitration id. While the id is unknown: all but a sound sample."""
     remote_frames: int = 0
     error_frames: int = 0
     """Frames in which the controller reports trouble on the bus."""
@@ -111,7 +111,7 @@ class CanCounters(DriverCounters):
     controller_overflows: int = 0
     """Error frames that say that the controller's receive buffer overflowed."""
     kernel_drops: int = 0
-    """Frames that the kernel dropped because the socket's buffer was full (socketcan only)."""
+    """Frames that the kernel dropped because a socket was full (socketcan, udp_multicast)."""
     bus_off: int = 0
     bus_faults: int = 0
     """Failures of the bus or of python-can, also when opening it."""

@@ -80,7 +80,7 @@ class CanStream:
         self.counters = CanCounters()
         self.link = Link(NAME)
         self.last_error: str | None = None
-        """Text of the last failure of the bus or error frame; silence is not included."""
+        """Text of the last failure of the bus or error frame, not of silence; None: none yet."""
         self._where, self._sequence = bus, sequence
         self._accepted = 0
         self._silent_at_ns = 0
@@ -218,6 +218,6 @@ class CanStream:
 
 
 def _is_sound(words: bytes) -> bool:
-    """Return True if at least one word is a count and all others are of absent sensors."""
+    """Return True if each word is a count or of an absent sensor, and at least one is a count."""
     _, faults = decode_words(np.frombuffer(words, dtype=">u2"))
     return not (faults & ~np.uint8(ElectrodeFault.MISSING)).any() and not faults.all()

@@ -63,9 +63,9 @@ class SweepClock:
         self._end_ns: int | None = None
         self._at_ns = 0
         self._widest_ns = 0
-        """Longest time between two samples since the sweep before, ns."""
+        """Longest time between two samples since the last `learn_end`, ns."""
         self._is_torn = False
-        """True if a sweep that lacked its last sample was ended since then."""
+        """True if a sweep without its last sample was ended since the last `learn_end`."""
         self.interrupt()
 
     def interrupt(self) -> None:

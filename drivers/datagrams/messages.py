@@ -120,7 +120,7 @@ def _message(data: bytes, key: str) -> Message:
 
 
 def number(value: object) -> float:
-    """Return `value` if it is a finite number, else NaN. Booleans and text are not numbers."""
+    """Return `value` if it is a number up to +-`NUMBER_MAX`, else NaN; also NaN for booleans."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return math.nan
     return float(value) if abs(value) <= NUMBER_MAX else math.nan

@@ -125,7 +125,7 @@ class PalmCounters(DatagramCounters):
     nonsense_packets: int = 0
     """Packets with a field that has a value which no palm sends."""
     lost_packets: int = 0
-    """Packets missing from rounds that were handed over."""
+    """Packets missing from rounds that were handed over, and all 14 of each missed round."""
     duplicate_packets: int = 0
     """Packets that arrived twice; the copy is dropped."""
     reordered_packets: int = 0
@@ -133,7 +133,8 @@ class PalmCounters(DatagramCounters):
     late_packets: int = 0
     """Packets that arrived when their round was over; dropped."""
     conflicting_packets: int = 0
-    """Packets for a place that another packet had taken; both are dropped."""
+    """Packets for a place that another packet had taken; dropped, and that other one too unless its
+    round was handed over."""
     unsynchronised_packets: int = 0
     """Packets dropped until a round began, after opening or an outage."""
     interrupted_rounds: int = 0

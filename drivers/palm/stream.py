@@ -7,7 +7,7 @@ so the place of a packet follows from its type and the furthest packet before it
   round that lacks packets is handed over when the first packet of the next round arrives.
 - A packet up to half a round late takes its place while its round is the current one.
 - Two different packets for one place contradict each other (a damaged `tactile_type`, or a request
-  that stands still). Both are dropped, and the place is `MISSING`.
+  that stands still). Both are dropped, and the place is `MISSING`; after its round only the second.
 - Lost whole rounds are noticed by time alone, `LATE_MAX` cycles after a packet was due.
 
 Packets have no checksum; UDP's own covers only the way from the relay. Two kinds of earlier damage
@@ -101,7 +101,7 @@ class PalmStream:
         self._known = np.zeros(shape, dtype=np.bool_)
         self._was_absent = np.zeros(len(fingers), dtype=np.bool_)
         self._place: int | None = None
-        """Furthest place so far, counted over all rounds; None before the first round."""
+        """Furthest place so far, counted over all rounds; None: no round since `interrupt`."""
         self._place_t_ns: int | None = None
         self._interrupted = False
         self._begin(0)
@@ -122,7 +122,7 @@ class PalmStream:
 
     @property
     def cycles_to_go(self) -> int:
-        """Fewest packets until the current round is complete; 0 before the first round."""
+        """Fewest packets until the current round is complete; 0 if none has begun."""
         return 0 if self._place is None else (ROUND - 1 - self._place) % ROUND
 
     def receive(self, data: bytes, t_ns: int) -> Sequence[Reading] | None:

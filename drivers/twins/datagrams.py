@@ -37,7 +37,7 @@ SENSORS_AT_REST = (
 )
 """Raw sensor words of a real hand at rest (Shadow's documentation)."""
 HALL_WORDS = 26
-"""Number of these words, from the first, that get noise of up to one count."""
+"""Number of Hall sensors, the first words, which get noise of up to one count."""
 OTHER_COUNTS = {"PDC": 2779, "TAC": 2006, "TDC": 2247}
 PAC_COUNT = 2048
 ABSENT_WORDS = {"PDC": -22072 & 0xFFFF, "TAC": 32570, "TDC": 0}

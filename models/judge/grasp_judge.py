@@ -107,7 +107,7 @@ class GraspJudge:
     ) -> None:
         """`takes`: input of the network. `seen`: its training counts, of these fingers.
 
-        `slip_threshold`: probability of slip, 0..1, that a moved probability never crosses.
+        `slip_threshold`: probability of slip, between 0 and 1, that a moved one never crosses.
         """
         self._network = network
         self._fingers = tuple(fingers)

@@ -38,7 +38,7 @@ def assess(
 ) -> Assessment:
     """Assess a grasp by the model's `p_slip`, its log-odds `margin`, and its flat `inputs`.
 
-    `name`: id of the grasp, which decides by a hash if it is supervised. `awaited`: announced lifts
+    `name`: `GraspId` of the grasp, whose hash may have it supervised. `awaited`: announced lifts
     of other grasps whose outcome can still come. Raises `ValueError` for values that are not finite
     or of another shape; such a grasp must be `unknown`.
     """

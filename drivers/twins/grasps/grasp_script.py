@@ -15,7 +15,7 @@ FINGER_LEAD_S = 0.05
 CREEP_SHARE: Range = (0.05, 0.07)
 """Share of the final deviation from rest that is missing when closing ends, due to creep."""
 CREEP_TAU_S: Range = (0.10, 0.14)
-"""Time constant of that creep, s."""
+"""Time constant of the creep after closing, s."""
 LOAD_COUNTS: Range = (20.0, 60.0)
 """Fall of a finger's most pressed electrode under load, counts; a grasp causes far more."""
 LOAD_S = 0.15

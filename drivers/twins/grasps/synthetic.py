@@ -56,6 +56,7 @@ class SyntheticGrasps:
     """Grasps drawn by `draw`."""
 
     counts: NDArray[np.uint16]
+    """Shape (grasps, 72)."""
     slipped: NDArray[np.bool_]
     component: NDArray[np.int64]
     """Shape (grasps,): mixture component, from 0, instead of an object."""

@@ -238,7 +238,7 @@ def synthetic_grasps(
     loop: bool = False,
     seed: int = 0,
 ) -> WholeGrasps:
-    """Return a stream of synthetic grasps, half of them slips. Raises `ValueError` for a rate.
+    """Return a stream of synthetic grasps, half of them slips. Raises as `WholeGrasps`.
 
     `grasps`: number of different ones. The other arguments are those of `WholeGrasps`.
     """
