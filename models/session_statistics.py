@@ -196,8 +196,8 @@ def is_odd(
 ) -> bool:
     """Return True if a session cannot have come from grasps of these fingers.
 
-    There are three cases: the sensors are far off; fingers are swapped; a finger is dead or has
-    only noise, which is tested if `enough` is True (enough grasps). Mean and spread of each
+    There are three cases: the sensors are far off; fingers are swapped; a finger's spread is too
+    small or too large, which is tested if `enough` is True (enough grasps). Mean and spread of each
     electrode, in session and training: counts, shape (fingers, 24).
     """
     ratio = np.sort(spread / training_spread, axis=1)

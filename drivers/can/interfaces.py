@@ -63,7 +63,7 @@ _BITRATES: Final = {
     "slcan": (10, 20, 50, 83.3, 100, 125, 250, 500, 750, 1000),
     "seeedstudio": (5, 10, 20, 50, 100, 125, 200, 250, 400, 500, 800, 1000),
 }
-"""Rates that adapters of an interface support, kbit/s. Other interfaces take any rate."""
+"""Rates that adapters of an interface support, kbit/s. Those of others are not checked."""
 _OWN_KEYS: Final = frozenset({"interface", "channel", "bitrate"})
 _PORT: Final = Annotated[int, msgspec.Meta(ge=1, le=65535)]
 _TYPES: Final[dict[str, dict[str, Any]]] = {

@@ -32,7 +32,7 @@ class JointCounters(MessageCounters):
     """Counters of joint messages."""
 
     bad_angles: int = 0
-    """Values that are not an angle in radians; handed over as NaN."""
+    """Values that are not an angle in radians, or a joint's second; handed over as NaN."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

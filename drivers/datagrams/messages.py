@@ -21,7 +21,7 @@ SILENCE_NS: Final = 500_000_000
 NUMBER_MAX: Final = (1 << 63) - 1
 """Largest absolute value of a number that is read."""
 SEQ_JUMP_MAX: Final = 1000
-"""Largest jump ahead of `seq` that counts as a loss; after a larger one the sender restarted."""
+"""Most messages that a gap in `seq` counts as lost; at a larger gap the sender restarted."""
 OLD_MESSAGES_MAX: Final = 10
 """Most old messages in a row, each newer than the last, that count as delayed. With one more the
 sender has restarted."""

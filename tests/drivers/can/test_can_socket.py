@@ -235,7 +235,7 @@ def plug(path: Path) -> tuple[int, int]:
 
 
 def from_adapter(interface: str, path: Path, clock: Clock) -> CanBridgeDriver:
-    """By a clock that stands still: a stalled machine would drop frames without stamps."""
+    """Return a driver. Its clock must stand still, or a stall would drop frames without stamps."""
     options: dict[str, Any] = {"arbitration_id": SAMPLE_ID, "sequence": "electrodes"}
     return CanBridgeDriver(interface, str(path), clock=clock, **options)
 

@@ -268,8 +268,8 @@ PLACES: dict[str, Callable[[int, int], bool]] = {
     "far back": lambda place, last: place < last - 3,
     "jump": lambda place, last: place in (21, 22, 23) and last in (0, 1, 2),
 }
-"""By words of `PAGE` for a sample's place: are they true of this place and the furthest one, both
-from 0?"""
+"""By words of `PAGE`: function that returns True if they are true of a sample's place and of the
+furthest place before, both from 0."""
 OUT = ", reading has ended"
 TIMES = {"any": set(Timing), "late": {Timing.LATE}, "early": {Timing.EARLY}}
 HELD = {

@@ -150,7 +150,7 @@ def test_the_first_reading_after_a_sender_restart_is_interrupted() -> None:
     ],
     ids=["queue", "no time", "time stands", "milliseconds", "clock set"],
 )
-def test_angles_that_waited_in_a_queue_have_their_age(
+def test_sender_time_dates_joint_readings_and_its_leaps_are_dropped(
     sent: list[tuple[float | None, float]], made: list[float], interrupted: int | None
 ) -> None:
     stream, readings = JointStream(), list[JointReading]()

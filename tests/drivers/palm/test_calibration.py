@@ -125,7 +125,7 @@ def test_an_angle_over_ten_degrees_beyond_range_is_impossible() -> None:
             assert impossible_angles(angles) == impossible, joint
 
 
-def test_sensors_stand_where_shadows_headers_have_them() -> None:
+def test_the_sensor_indices_of_joints_are_those_of_shadows_headers() -> None:
     """`sensors[]` of the palm headers: THJ5 and WRJ1 have two, A and B."""
     order = [f"{finger}J{joint}" for finger in ("FF", "MF", "RF") for joint in (1, 2, 3, 4)]
     order += ["LFJ1", "LFJ2", "LFJ3", "LFJ4", "LFJ5", "THJ1", "THJ2", "THJ3", "THJ4"]
@@ -172,7 +172,7 @@ GRID = [
     (1000.0 + 500 * i, 1000.0 + 500 * j, 15.0 * i + 3 * ((i + j) % 2), 15.0 * j - 10)
     for i, j in itertools.product(range(3), repeat=2)
 ]
-"""Raw pairs on a square grid, as of a jig; each square has two ways to be cut."""
+"""Raw pairs on a square grid, as of a jig; each square can be cut into triangles in two ways."""
 ANYWHERE = np.random.default_rng(5).uniform((500, 500, -15, -15), (3500, 3500, 40, 40), (25, 4))
 
 

@@ -20,7 +20,7 @@ from graspd.drivers.twins.grasps.whole_grasps import Counting
 PALM_ROWS = 7
 """Number of rows, 10 ms apart, after which a round of 14 ms begins with a row again."""
 PALM_STALE_ROWS = 2
-"""Number of these rows that repeat an electrode: 28.57 %, verified in the untouched recording."""
+"""Number of `PALM_ROWS` that repeat an electrode: 28.57 %, verified in the untouched recording."""
 
 
 def played(

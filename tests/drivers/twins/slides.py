@@ -27,16 +27,16 @@ SPIKE_COUNTS = (25.0, 60.0)
 RELAXATION_COUNTS_PER_S = 12.0
 """Root mean square of an electrode's speed when the median hold begins, counts/s."""
 RELAXATION_SPREAD = 0.6
-"""Standard deviation of the logarithm of that speed, between holds."""
+"""Standard deviation of the logarithm of `RELAXATION_COUNTS_PER_S`, between holds."""
 RELAXATION_TAU_S = 0.7
 """Time constant of the motion after a hold begins, s. Not measured; it fits the quantiles of held
 touches."""
 HOLD_DIRECTIONS = (0.68, 0.32)
-"""Shares of a hold's variance along one direction of the 24 electrodes, and along others."""
+"""Shares of a hold's variance along each of two directions of the 24 electrodes."""
 WANDER_COUNTS_PER_S = 66.0
 """Root mean square of an electrode's speed as the pressure of a hold wanders, counts/s."""
 WANDER_SPREAD, WANDER_MOMENT_SPREAD = 0.3, 0.25
-"""Standard deviations of the logarithm of that speed, between holds and between moments of a hold.
+"""Standard deviations of the wander's logarithmic speed, between holds, and between moments of one.
 These and the times fit the quantiles of held touches, and the time for which a gate with one limit
 counted real ones as moving."""
 WANDER_TURN_TAU_S = 0.02
@@ -44,7 +44,7 @@ WANDER_TURN_TAU_S = 0.02
 WANDER_TAU_S = 0.06
 """Time after which the wander has gone back, s."""
 SLIDE_DIRECTIONS = (0.81, 0.14, 0.05)
-"""Shares of a slide's variance along one direction, along a second, and along others."""
+"""Shares of a slide's variance along each of three directions."""
 STANDSTILL_S = (0.0, 0.2)
 """Shortest and longest time without a slide at the beginning, and again at the end, s."""
 SLIDE_WANDER = 1.5
@@ -52,10 +52,10 @@ SLIDE_WANDER = 1.5
 SPEED_COUNTS_PER_S = 76.0
 """Root mean square of an electrode's speed in the median slide, counts/s."""
 SLIDE_SPREAD, MOMENT_SPREAD = 0.58, 0.5
-"""Standard deviations of the logarithm of that speed, between slides and between moments of a
-slide. These and the times fit the quantiles of slides."""
+"""Standard deviations of the logarithm of a slide's speed, between slides and between its
+moments. These and the times fit the quantiles of slides."""
 MOMENT_TAU_S = 0.2
-"""Time after which the speed of a slide is another one, s, because the object sticks and slips."""
+"""Time after which a wander or slide has another speed, s, as the object sticks and slips."""
 TURN_TAU_S = 0.1
 """Time after which a slide has another direction, s."""
 STEP_S = 0.005

@@ -1,4 +1,4 @@
-"""One model's opinion: what is kept from it, and its probability, margin and softening."""
+"""One model's opinion: which grasps it does not get, and its probability, margin and softening."""
 
 from __future__ import annotations
 
@@ -212,7 +212,7 @@ def of_sessions() -> GraspJudge:
     ("stretched", "known", "judged", "learned"),
     [
         (1.0, {}, True, True),
-        (1.0, {"odd": True}, False, True),  # near the training, in a session that is none
+        (1.0, {"odd": True}, False, True),  # near the training, but the session is odd
         (1.6, {}, False, True),  # up to twice as far a session learns from what it cannot judge
         (4.0, {}, False, False),
         (4.0, {"calibrated": False}, False, True),  # a young one learns from all
