@@ -61,7 +61,7 @@ def fingers_of(names: Sequence[str]) -> tuple[Finger, ...]:
 
 
 def write_csv(table: Any, folder: str) -> Path:  # noqa: ANN401
-    """Write `table.csv` in a folder, a missing value as an empty cell; return the file's path.
+    """Write `table.csv` in a folder, missing values as `nan` or empty; return the path.
 
     NUL is left out of text; what UTF-8 cannot encode is escaped, as `\\udcff`. Raises `ValueError`
     for a column that occurs twice, is of float16, or differs in length.
