@@ -76,7 +76,7 @@ def test_the_dbc_file_knows_every_channel_of_the_manual(dbc: Database) -> None:
         ),
     ],
 )
-def test_the_kernels_structs_are_read(raw: str, frame: CanFrame) -> None:
+def test_a_can_frame_of_the_kernel_is_unpacked_with_flags(raw: str, frame: CanFrame) -> None:
     """Layout by linux/can.h, on a little-endian machine."""
     assert unpack_frame(bytes.fromhex(raw)) == frame
 
@@ -86,7 +86,7 @@ def test_other_bytes_than_a_kernel_struct_are_not_a_frame(raw: bytes) -> None:
     assert unpack_frame(raw) is None
 
 
-def test_error_frames_say_what_happened() -> None:
+def test_error_frames_are_recognised_and_described_by_class() -> None:
     """Classes and bits of linux/can/error.h."""
     bus_off = CanFrame(0x040, bytes(8), ERROR)
     overflow = CanFrame(0x004, bytes.fromhex("0001000000000000"), ERROR)
@@ -248,7 +248,9 @@ def test_an_interface_without_its_package_or_library_is_refused(
     ("interface", "rates"),
     [("slcan", slcanBus._BITRATES), ("seeedstudio", SeeedBus.BITRATE)],  # noqa: SLF001
 )
-def test_bit_rates_are_those_of_python_can(interface: str, rates: Mapping[int, object]) -> None:
+def test_only_bit_rates_that_python_can_has_are_accepted(
+    interface: str, rates: Mapping[int, object]
+) -> None:
     for bitrate in rates:
         CanBridgeDriver(interface, "/dev/ttyUSB0", bitrate=bitrate)
     with pytest.raises(ValueError, match=f"has {', '.join(map(str, sorted(rates)))}$"):
