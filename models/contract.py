@@ -100,7 +100,7 @@ class Sharpness(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Temperature of a session model's probabilities while the session is young."""
 
     grasps: Annotated[float, msgspec.Meta(ge=0.0)]
-    """Weight of the session's statistics, grasps, from which on this temperature is used."""
+    """Number of grasps of the session from which on this temperature is used."""
     temperature: Annotated[float, msgspec.Meta(ge=1.0)]
     """Divisor of the margin (log-odds of slip), measured on a held-out session."""
 
@@ -121,7 +121,7 @@ class SessionInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag=
     prior_grasps: Annotated[float, msgspec.Meta(gt=0.0)]
     """Weight of the training's statistics, grasps."""
     calibrated_from: Annotated[float, msgspec.Meta(ge=0.0)]
-    """Weight of the statistics, grasps, from which on the session counts as calibrated."""
+    """Number of grasps from which on the session counts as calibrated."""
     sharpness: tuple[Sharpness, ...]
     """Temperatures, ascending in `grasps` from 0."""
 

@@ -17,7 +17,7 @@ from graspd.models.contract import ModelError
 from graspd.models.runtime import TactileModel
 
 METADATA_KEY = "graspd-grasps"
-"""Key of an ONNX file's metadata, beside its contract, of the training grasps' `as_text`."""
+"""Key in an ONNX file's metadata, beside its contract, of the training grasps' hashes as text."""
 PUBLISHED = zoo.ZOO / "published-grasps.crc32"
 """Hashes of the grasps of all published tables, little-endian, in the order of `TABLES`."""
 
@@ -61,7 +61,8 @@ def of_model(model: TactileModel) -> Hashes:
 
 
 def _of_published(digests: Sequence[str], fingers: Sequence[Finger]) -> Hashes:
-    """Return the hashes of all grasps of the published tables with these digests (SHA-256)."""
+    """Return the hashes of all grasps of the published tables with these digests (SHA-256); no rows
+    if the tables lack a finger."""
     if not set(fingers) <= set(TABLE_FINGERS):
         return np.empty((0, len(fingers)), np.uint32)
     rows = np.fromfile(PUBLISHED, "<u4").reshape(-1, len(TABLE_FINGERS))

@@ -128,8 +128,8 @@ class CanBus:
                 port.close()
 
     def drain(self) -> list[Stamped]:
-        """Return the frames that wait, at most `FRAMES_PER_DRAIN`, oldest first. Never raises; a
-        broken bus sets `failure`."""
+        """Return the frames that wait, `FRAMES_PER_DRAIN` at most, and markers `LOST`, in order.
+        Never raises; a broken bus sets `failure`."""
         frames: list[Stamped] = []
         self.more = False
         try:

@@ -38,7 +38,8 @@ class Permission(StrEnum):
     UNPROVEN = "unproven"
     """Too few outcomes are known, or too many announced lifts lack one. Lift under supervision."""
     RISK_EXCEEDED = "risk-exceeded"
-    """More lifts slipped than the rule can make up for. Nothing is `stable` until a reset."""
+    """More lifts slipped than the rule can make up for. Nothing is `stable` until a reset, or until
+    earlier `stable` lifts are reported to have held."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +139,7 @@ class Risk:
 
     @property
     def bound(self) -> float | None:
-        """Upper bound of `slips`; each lift without an outcome adds one. None: no rule."""
+        """Upper bound of `slips`, to which lifts without an outcome may add. None: no rule."""
         alpha = self.limits.max_slip_when_stable
         if alpha is None:
             return None
