@@ -66,7 +66,7 @@ class Examined(msgspec.Struct, frozen=True, eq=False, gc=False):
     refusal: Refusal | None = None
     """Why they must not be judged; None: they are sound, or could be repaired."""
     repaired: tuple[str, ...] = ()
-    """Electrodes that were repaired because they are broken or contradict the others, as `ff_7`."""
+    """Electrodes repaired as they are broken or contradict the others, as `ff_7`; () if refused."""
     grasp: NDArray[np.generic] | None = None
     """Counts that the session may learn from, shape (fingers, 24). None: it must not.
 
