@@ -1,4 +1,4 @@
-"""The committed models: they run, they say what they are, and they judge as their weights say."""
+"""The committed models: their cards and figures are right, and they know their grasps again."""
 
 from __future__ import annotations
 

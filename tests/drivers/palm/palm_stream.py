@@ -1,4 +1,4 @@
-"""Palm packets for tests: made by the twin or by hand, played through the parts that judge them."""
+"""Palm packets for tests: made by the twin or by hand, passed through a `PalmStream`."""
 
 from __future__ import annotations
 

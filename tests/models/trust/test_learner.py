@@ -1,4 +1,4 @@
-"""The learner against batch fits, and against what could break it."""
+"""The learner's bounds: outcomes, values and states that could break or mislead it."""
 
 from __future__ import annotations
 
