@@ -1,4 +1,4 @@
-"""The plain joint stream: what is a message, what an angle, in which order, from whom."""
+"""The joint stream: what is a message, what an angle, which messages are new, and their times."""
 
 from __future__ import annotations
 
