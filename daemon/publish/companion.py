@@ -56,7 +56,7 @@ class LoopEvent(Enum):
     SKIPPED = "skipped"
     """Readings before the next one were skipped."""
     ANNOUNCED = "announced"
-    """A controller asked whether it may lift, and the answer was `stable` or `supervised`."""
+    """A controller that asked may lift, as the verdict is `stable` or `supervised`."""
     TAKEN_BACK = "taken-back"
     """No lift follows an announcement."""
 
@@ -111,7 +111,7 @@ class Companion:
         """A reading has come. A tactile one is judged, or skipped, after this call."""
 
     def on_event(self, event: LoopEvent, grasp: GraspId | None = None) -> None:
-        """An event has come before the next reading. `grasp`: the announced one, if any."""
+        """An event has come before the next reading. `grasp`: announced or taken back, or None."""
 
     def on_verdict(self, published: PublishedVerdict) -> None:
         """A verdict was published."""

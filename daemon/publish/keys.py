@@ -124,7 +124,7 @@ class Admission:
     """`state` of the folder when it was last read; None: not read yet."""
 
     def look(self) -> bool:
-        """Read the folder if it has changed; return True if a key was removed.
+        """Read the folder if it has changed; return True if an admitted key no longer is.
 
         A folder that cannot be read, or that others may write, admits no peer.
         """

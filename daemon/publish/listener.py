@@ -75,13 +75,14 @@ class Listener:
         made.listen(BACKLOG)  # last, so that no peer connects before mode and group are set
 
     def fileno(self) -> int:
-        """Return the descriptor of the listening socket. Raises `PublishError` after `close`."""
+        """Return the descriptor of the listening socket; -1 after `close`."""
         if self.socket is None:
             raise PublishError(f"{self.endpoint}: closed")
         return self.socket.fileno()
 
     def close(self) -> None:
-        """Stop listening; remove the socket's file and `PATH.lock`. May be called again."""
+        """Stop listening; remove `PATH.lock` and the socket's file, unless it was replaced. May be
+        called again."""
         if self.socket is not None:
             self.socket.close()
         lock, self._lock = self._lock, None

@@ -305,7 +305,7 @@ def withheld(verdict: Verdict, *reasons: Reason) -> bytes:
 
 
 decode_outcome = msgspec.json.Decoder(OutcomeMessage).decode
-"""Decode the payload of an outcome. Raises `msgspec.DecodeError`."""
+"""Decode the payload of an outcome. Raises `ValueError`."""
 
 
 def schema() -> dict[str, Any]:

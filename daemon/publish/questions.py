@@ -83,7 +83,7 @@ class Questions:
         self._last: PublishedVerdict | None = None
         self._last_lifts: dict[Peer, GraspId | None] = {}
         """Grasp that the last `lift` of a connection offered; None: it was no offer. Only of those
-        with an open lift; the oldest first, `LIFTS_MAX` at most."""
+        that own a grasp without outcome; the oldest first, `LIFTS_MAX` at most."""
 
     def serve(self, messages: Iterable[Frames], now_ns: int, requests: Requests) -> int | None:
         """Handle messages that arrived by `now_ns`; answer questions that are due by then.
@@ -221,7 +221,7 @@ class Questions:
         return [Reason.STALE]
 
     def answer(self, published: PublishedVerdict, now_ns: int | None = None) -> None:
-        """Answer waiting questions with this verdict.
+        """Answer waiting questions with this verdict; permit a lift only once that is on the disk.
 
         `now_ns`: answer only questions that are due by then or wait for the disk; None: answer all.
         """

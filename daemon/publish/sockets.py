@@ -126,7 +126,7 @@ class Sockets(Companion):
             self._counters["dropped"] += 1
 
     def wanted(self, topic: bytes) -> bool:
-        """Return True if this topic is due; for readings only once per period (`tactile_hz`)."""
+        """Return True if this topic is due; of readings one per period, none at `tactile_hz` 0."""
         if not topic.startswith(TACTILE):
             return True
         if self._tactile_period_ns is None:
@@ -151,7 +151,7 @@ class Sockets(Companion):
         return self.questions.serve(self._door.receive(), self._clock(), requests)
 
     def on_verdict(self, published: PublishedVerdict) -> None:
-        """Answer all questions if `published.is_answer`, else only those that are due."""
+        """Answer all questions if `published.is_answer`, else those due or waiting for the disk."""
         if self.questions is not None:
             self.questions.answer(published, None if published.is_answer else self._clock())
 
@@ -218,7 +218,7 @@ class Door:
         self._due_s = 0.0
         """Time from which this status is late, monotonic s."""
         self.is_late = False
-        """True if the loop's own subscriber received the last status late, or has not yet."""
+        """True if the loop's own subscriber did not receive the last status within `LATE_S`."""
         self._out = self._socket(zmq.PUSH, porter.MESSAGES, sent=high_water_mark)
         self._echo = self._socket(zmq.SUB, porter.ECHO)
         self._echo.subscribe(STATUS)
@@ -277,7 +277,7 @@ class Door:
         return int(self._ask.getsockopt(zmq.FD))
 
     def send(self, topic: bytes, payload: bytes) -> bool:
-        """Publish one message; return False if it is dropped because the process is behind."""
+        """Publish one message; return False if it is dropped: the process is behind or ended."""
         if topic.startswith(STATUS):
             self._unheard, self._due_s = payload, time.monotonic() + LATE_S
             self.is_late = False

@@ -31,8 +31,9 @@ def read_grasps(path: str | os.PathLike[str], *, read_as: ReadAs | None = None) 
     """Return grasps with known outcome: columns `object`, `slipped` and, finger by finger, counts.
 
     `path`: a grasp table, or a recording (MCAP); `-` is standard input. Pass `read_as="table"`
-    for a table in which many rows repeat each other. Grasps without an outcome are left out; those
-    of a table are counted in a warning. Raises `RecordingError`.
+    for a table in which many rows repeat each other. A missing or damaged count is NaN. Grasps
+    without an outcome are left out, those of a table with a warning; of a recording also those
+    judged with repaired electrodes or with the counts of an earlier one. Raises `RecordingError`.
     """
     with files_of([Path(path)]) as (file,):
         return _grasps(file, read_as)

@@ -17,7 +17,7 @@ ADDRESS: Final = "127.0.0.1"
 BACKLOG: Final = 256
 """Most messages that wait for a viewer; a slow one loses the oldest."""
 CHANNELS_MAX: Final = 128
-"""Most topics, enough for about ten hands."""
+"""Most topics, seven for each hand; also most hands."""
 
 
 class LiveServer:

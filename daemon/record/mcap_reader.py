@@ -63,7 +63,7 @@ class RecordedMessage(NamedTuple):
     """One message of a recording."""
 
     kind: str
-    """First part of the topic: a value of `Topic`, or unknown."""
+    """First part of the topic: a value of `Topic`, or any other text."""
     at_ns: int
     """Time when it was recorded, on the monotonic clock of the recording daemon, ns."""
     payload: bytes

@@ -79,7 +79,7 @@ class McapReplayDriver(ReadingsDriver[_Item]):
         self.start(self._items())
 
     def read_ready(self) -> Sequence[Reading]:
-        """Return the next reading if it is due; pass events to `on_event`."""
+        """Return the next reading if it is due, or pass the next event to `on_event`: then `()`."""
         taken = self.take()
         if taken is None:
             return ()

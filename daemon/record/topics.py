@@ -133,7 +133,7 @@ class Topic(StrEnum):
     SKIPPED = "skipped"
     """Readings before the next one were skipped."""
     ANNOUNCED = "announced"
-    """A controller asked if it may lift, and the answer was `stable` or `supervised`."""
+    """A controller that asked may lift, as the verdict is `stable` or `supervised`."""
     TAKEN_BACK = "taken-back"
     """No lift follows an announcement."""
     # Made from these for viewers:
@@ -199,7 +199,7 @@ def decode_judged(payload: bytes) -> Judged:
 def tactile_reading(payload: bytes, fingers: Sequence[str]) -> TactileReading:
     """Return the reading of a `tactile` message, with rows in the order of `fingers`.
 
-    Raises `ValueError`, also if one is missing, or `OverflowError`.
+    Raises `ValueError`, also if a finger is missing, or `OverflowError` for a huge count.
     """
     content = _decode(payload)
     content["counts"] = table(content.get("counts"))
@@ -214,7 +214,7 @@ def tactile_reading(payload: bytes, fingers: Sequence[str]) -> TactileReading:
 
 
 def boot_id_of(payload: bytes) -> bytes:
-    """Return the `boot_id` of a `tactile` message. Raises `ValueError`."""
+    """Return the `boot_id` of a well-formed `tactile` message."""
     return str(_decode(payload)["boot_id"]).encode()
 
 
@@ -230,7 +230,8 @@ def joint_reading(payload: bytes) -> JointReading:
 
 
 def flat(value: object) -> object:
-    """Return a message without null; each table becomes one list, row by row."""
+    """Return a message without null fields; a finger's null state becomes `UNKNOWN`, and each
+    table one list, row by row."""
     if isinstance(value, dict):
         return {name: _part(name, one) for name, one in value.items() if one is not None}
     if isinstance(value, list) and value and isinstance(value[0], list):
