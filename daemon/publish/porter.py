@@ -186,8 +186,8 @@ class Courier(Proxy):
         return True
 
     def _credential(self, frame: zmq.Frame) -> bytes:
-        """Return the sender: `user <uid>` by the kernel, `key <name>` by the handshake, or b"", as
-        for a user whom the kernel does not tell apart from others."""
+        """Return the sender: `user <uid>` by the kernel, `key <name>` by the handshake, or b"" on
+        `tcp://` without keys, and for a user whom the kernel does not tell apart from others."""
         with suppress(zmq.ZMQError):  # libzmq knows nothing of the sender
             if self.endpoint.startswith("ipc://"):
                 _, *numbers = str(frame.get("Peer-Address")).rsplit(":", 3)  # uid, gid, pid

@@ -142,7 +142,7 @@ class Sockets(Companion):
         return self._door is not None and self._door.answer(frames)
 
     def before_wait(self, requests: Requests) -> int | None:
-        """Restart an ended process; serve questions. Return when one is due, ns, or None."""
+        """Restart an ended process; serve questions. Return when the next is due, ns, or None."""
         if self._door is None:
             return None
         self._door.check()

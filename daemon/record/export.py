@@ -51,8 +51,9 @@ class Export:
     """The grasps of some recordings, and the numbers of those left out.
 
     A grasp has the counts that were judged last when `lift` was answered yes, maybe again. If no
-    controller asked, those of the first `stable` verdict; if there is none, those judged last. The
-    daemon learns the same (`LiftBook.note`): later counts may be of an object in the air.
+    controller asked, those judged last up to the first `stable` verdict; if there is none, those
+    judged last of all. Later counts may be of an object in the air; the daemon does not learn from
+    them either (`LiftBook.note`).
     """
 
     fingers: tuple[str, ...] = ()

@@ -198,7 +198,7 @@ def test_the_keys_command_makes_and_lists_keys_and_checks_rights(tmp_path: Path)
     assert graspd("keys", "list", "--dir", tmp_path).returncode == 2
 
 
-def test_listing_keys_of_a_missing_folder_is_refused(
+def test_listing_keys_refuses_a_missing_folder_only_if_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     missing = tmp_path / "kesy"

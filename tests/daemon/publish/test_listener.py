@@ -38,7 +38,7 @@ OTHERS: dict[str, Callable[[Path], object]] = {
 
 @pytest.mark.parametrize("kind", OTHERS)
 @pytest.mark.parametrize("name", ["v", "v.lock"])
-def test_a_foreign_file_at_the_path_is_refused_and_kept(
+def test_foreign_files_at_socket_and_lock_paths_are_refused_and_kept(
     tmp_path: Path, name: str, kind: str
 ) -> None:
     path = tmp_path / name

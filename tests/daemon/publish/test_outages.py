@@ -1,7 +1,7 @@
 """A sensor or link lost in the middle of a grasp gives `unknown`, with the reason.
 
-Daemon and subscriber are real processes, the serial line and the sockets are real; only the
-hardware is a twin. Lost joints are tested in the simulated days, a killed daemon in
+The daemon is a real process, the serial line and the sockets are real; only the hardware is a
+twin. Lost joints are tested in the simulated days, a killed daemon in
 tests/clients/test_against_daemon.py.
 """
 

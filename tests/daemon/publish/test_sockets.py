@@ -124,7 +124,9 @@ def test_socket_files_have_the_scenes_mode_and_group(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("publish", "mode"), [("0666", 0o660), ("0640", 0o640), (None, 0o755)])
-def test_only_owner_and_group_may_ask(tmp_path: Path, publish: str | None, mode: int) -> None:
+def test_users_outside_owner_and_group_may_not_ask(
+    tmp_path: Path, publish: str | None, mode: int
+) -> None:
     former = os.umask(0o022)
     try:
         with Sockets(scene_of(tmp_path, publish={"file_mode": publish})):

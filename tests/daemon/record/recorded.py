@@ -21,7 +21,7 @@ HEADER = RecordingHeader(
     fingers=("ff", "th"), joints=True, boot_id=BOOT, scene={}, model="any", model_sha256=""
 )
 NO_STATUS = cast(Status, None)
-"""Status that a recorder is called with and ignores; it records the message of the status."""
+"""Argument of `on_status`, which a recorder ignores: it records what `send` gives it."""
 
 IGNORED_FIELDS = frozenset(
     {"boot_id", "seq", "t", "t_mono_ns", "age_ms", "latency_us", "silence_ms"}

@@ -150,7 +150,9 @@ LIFTS = {
 
 
 @pytest.mark.parametrize(("verdicts", "lifted"), LIFTS.values(), ids=LIFTS)
-def test_a_grasp_has_its_counts_at_the_lift(tmp_path: Path, verdicts: str, lifted: int) -> None:
+def test_an_exported_grasp_has_the_counts_judged_before_its_lift(
+    tmp_path: Path, verdicts: str, lifted: int
+) -> None:
     writer, counts = Writer(tmp_path / "a.mcap"), iter(sweeps(3))
     for words in map(str.split, verdicts.split(", ")):
         writer.verdict(int(words[0]), words[1])
@@ -232,7 +234,7 @@ def test_standard_streams_serve_as_recording_and_as_table(
     assert not Path("-").exists()
 
 
-def test_an_unusable_folder_or_missing_extra_is_refused_unread(
+def test_export_checks_folder_and_extra_before_reading_the_recording(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     unread, missing = tmp_path / "not-there.mcap", tmp_path / "missing"
@@ -287,7 +289,7 @@ def test_without_any_outcome_nothing_is_written(tmp_path: Path) -> None:
 # Tables of pandas.
 
 
-def test_a_stream_or_a_table_without_outcomes_is_refused(tmp_path: Path) -> None:
+def test_read_grasps_refuses_a_stream_or_table_without_outcomes(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="is a stream"):
         read_grasps(DEMO_RECORDING)
     table = tmp_path / "grasps.csv"

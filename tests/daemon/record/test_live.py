@@ -68,7 +68,7 @@ class ViewerClient:
     def channels(self, wanted: set[str], send: Callable[[], None]) -> dict[str, dict[str, Any]]:
         """Return the advertised channels by topic; call `send` until all `wanted` are there.
 
-        A viewer that was paused for a second reconnects, and has lost the messages that waited.
+        `graspd watch`, if paused for a second, reconnects and loses the messages that waited.
         """
         found: dict[str, dict[str, Any]] = {}
         while not wanted <= found.keys():

@@ -189,7 +189,7 @@ def test_damage_raises_recording_error_or_nothing(changes: list[tuple[int, int]]
         read(bytes(data))
 
 
-def test_a_message_of_a_time_beyond_64_bits_is_refused(tmp_path: Path) -> None:
+def test_a_message_with_a_time_beyond_the_limit_is_refused(tmp_path: Path) -> None:
     file = McapWriter(tmp_path / "a.mcap", header("ff", joints=False))
     payload = {
         **{"v": 1, "boot_id": BOOT, "seq": 1, "t": 0.0, "t_mono_ns": 5},

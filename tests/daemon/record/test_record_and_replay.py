@@ -212,8 +212,8 @@ def test_a_file_of_another_run_is_refused(rotated: Lab, tmp_path: Path) -> None:
         list(judge([first, other]))
 
 
-def test_a_replay_takes_back_the_lift_that_the_run_did(rotated: Lab) -> None:
-    """Recordings from before say only that one was: the newest."""
+def test_a_replay_takes_back_the_same_lift_as_the_run(rotated: Lab) -> None:
+    """Old recordings do not name the grasp; then it is the newest announced one."""
     run = RecordedRun(rotated.files[:1])
     wanted, boot_id = run.scene({}, {}, None), run.header.boot_id
     parts = run.parts(wanted, assembly.load_model(wanted), None)

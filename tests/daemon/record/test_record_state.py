@@ -39,7 +39,7 @@ MS = 1_000_000
 STATUS, VERDICT = b"status.right", b"verdict.right"
 START_NS = 10**12
 NO_VERDICT = cast(Verdict, None)
-"""Verdict that a recorder is called with and ignores; it records the message of the verdict."""
+"""Verdict in the argument of `on_verdict`, which a recorder ignores: it records what is sent."""
 
 
 class Loop:

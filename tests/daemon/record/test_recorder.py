@@ -175,7 +175,7 @@ def test_entries_are_dropped_and_counted_while_a_disk_stalls(
     assert (loss.kind, last.kind) == ("dropped", before[-1].kind)
 
 
-def test_closing_does_not_wait_for_a_disk_that_hangs(
+def test_closing_warns_and_gives_up_on_a_hanging_disk(
     make: Make,
     disk: Disk,
     monkeypatch: pytest.MonkeyPatch,
