@@ -5,4 +5,4 @@ class PublishError(Exception):
     """An endpoint cannot be opened or served, or has no subscriber."""
 
     taken: str | None = None
-    """Endpoint that is in use by another program; None: the error has another cause."""
+    """`tcp://` endpoint that is in use by another program; None: the error has another cause."""

@@ -79,7 +79,8 @@ class McapReplayDriver(ReadingsDriver[_Item]):
         self.start(self._items())
 
     def read_ready(self) -> Sequence[Reading]:
-        """Return the next reading if it is due, or pass the next event to `on_event`: then `()`."""
+        """Return the next reading if it is due, or pass an event to `on_event` and return `()`. A
+        verdict is passed together with its reading."""
         taken = self.take()
         if taken is None:
             return ()
