@@ -44,7 +44,7 @@ Socket = zmq.Socket[bytes]
 MESSAGES, QUESTIONS, ECHO = "messages", "questions", "echo"
 """Names of the sockets to the loop, in a folder that only the daemon's user may enter."""
 MESSAGE_MAX_BYTES: Final = 1024
-"""Longest frame of a peer. An outcome has 128 bytes, the handshake with keys 257 (RFC 26)."""
+"""Longest frame of a peer. An outcome has up to 132 bytes, the handshake with keys 257 (RFC 26)."""
 TO_SUBSCRIBERS, TO_ASKERS, TO_LOOP = 1, 2, 4
 """Bits of libzmq's I/O threads (ZMQ_AFFINITY)."""
 HANDSHAKE_MS: Final = 5000

@@ -45,7 +45,7 @@ OPEN_MAX_BYTES: Final = 128 << 20
 """Most unpacked bytes of parts that are open at once, because their times overlap. A file with one
 part for each topic needs a tenth of it."""
 PARTS_MAX: Final = 100_000
-"""Most parts of a file; an hour at 100 Hz has 250."""
+"""Most parts of a file; an hour has 4,400, one for each flush."""
 RATIO_MAX: Final = 100
 """Largest ratio of unpacked to packed bytes; a recorded hold has 12, zeros have 36."""
 SEVERAL: Final = "is of several recordings put together: replay each alone"

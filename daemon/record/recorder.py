@@ -66,7 +66,7 @@ NEXT_FILES: Final = b"next"
 """Topic of an entry that begins new files; its content is a `MakeHeader`."""
 
 _Entry = tuple[int, bytes, object]
-"""Monotonic time, ns, topic, and payload or its maker; for `LINK` a tuple of its parts."""
+"""Monotonic time, ns, topic, and payload, a function that makes it, or parts of link traffic."""
 
 
 @dataclass(slots=True, eq=False)
