@@ -51,7 +51,7 @@ class ElectrodeFault(IntFlag):
     NOT_A_COUNT = 2
     """The value is not an integer in 0..4095."""
     PARITY = 4
-    """A byte of the response word has even parity, or a bit that must be 0 (manual figure 15)."""
+    """A byte of the word has even parity, or has a bit set that must be 0 (manual figure 15)."""
     ERROR_WORD = 8
     """The sensor answered with an error word instead of data (manual table 8)."""
     HELD = 16
@@ -152,17 +152,17 @@ class LinkCause(Enum):
     """The address to listen on is not one of this computer."""
     BUS_OFF = auto()
     SILENT = auto()
-    """The port is open, but no byte has arrived yet."""
+    """The port is open, but nothing valid has arrived yet."""
     NO_ANSWER = auto()
     FOREIGN = auto()
     """Data arrives only from a sender that is refused."""
     TIMEOUT = auto()
-    """Readings came, then stopped for longer than the timeout."""
+    """The link was given up because nothing valid arrived within its timeout."""
     DISCONNECTED = auto()
     """The device went away or was reset."""
     VERSION = auto()
     SETTINGS = auto()
-    """The device's electrodes or rate differ from those that the scene needs, or from before."""
+    """The device's sensors, samples or rate do not fit the scene, or have changed."""
     SERIALS = auto()
     """The device's serial numbers have changed, or differ each time it is asked."""
     CLOCK = auto()
@@ -241,7 +241,7 @@ class Driver(Protocol):
 
     @property
     def exhausted(self) -> bool:
-        """True when a recording has ended; always False for live links."""
+        """True when a recording has ended or failed; always False for live links."""
 
     @property
     def live(self) -> bool:
@@ -300,7 +300,10 @@ class LinkError(DriverError):
 
     @classmethod
     def from_errno(cls, error: BaseException, text: str, endpoint: str | None = None) -> LinkError:
-        """Return an error with the cause by `errno` of `error` or its causes, else `UNKNOWN`."""
+        """Return an error whose `cause` is by the `errno` of `error` or of an error behind it.
+
+        Without a known `errno` it is `UNKNOWN`.
+        """
         reason: BaseException | None = error
         while reason is not None:
             cause = _CAUSES.get(getattr(reason, "errno", None))

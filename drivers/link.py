@@ -160,9 +160,10 @@ class SenderClock:
         self._sent_ns = self._received_ns = 0
 
     def leaps(self, t_s: float | None, received_ns: int) -> bool:
-        """Return True if the sender's time rose over ten times as fast as ours since the last one.
+        """Return True if the sender's time, s, leapt ahead since that of the last `made_ns`.
 
-        Such a time was set or is not in seconds, so it shows no delay. 200 ms more are allowed.
+        A leap is over ten times the time passed here and 200 ms more: it was set or is not in
+        seconds, so it shows no delay. False for None, and before the first `made_ns`.
         """
         if t_s is None or self._offset_ns is None:
             return False

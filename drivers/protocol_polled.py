@@ -1,6 +1,6 @@
 """Serial ports without `select`, which fails for descriptors of 1024 and more. Nothing waits.
 
-Once it is imported, the module is, by its name, pyserial's handler of `polled://PATH`.
+Importing this module lets pyserial open `polled://PATH`: pyserial finds it by its name.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class PolledSerial(serial.Serial):
         raise serial.SerialException(errno.EIO, os.strerror(errno.EIO))
 
     def write(self, data: bytes, /) -> int:  # type: ignore[override]
-        """Write all bytes. Raises `SerialTimeoutException` if there is no room, else `OSError`."""
+        """Write all bytes. Raises `SerialTimeoutException` if not all find room, else `OSError`."""
         try:
             written = os.write(self.fileno(), data)
         except BlockingIOError:

@@ -172,8 +172,9 @@ class DatagramDriver(Opened, Generic[Stream]):
     """Driver that reads the datagrams of one sender by a stream.
 
     The sender (address and port) of the first good datagram is the only one until the link is
-    lost, so two hands need two ports. The constructor raises `ValueError` for a wrong `source`.
-    `open` raises `LinkError` if it cannot listen. No fault of the link makes `read_ready` raise.
+    lost, so two hands need two ports. The constructor raises `ValueError` for a wrong `source` or
+    `only_from`, and `open` `LinkError` if it cannot listen. No fault of the link makes `read_ready`
+    raise.
     """
 
     name: str
@@ -274,7 +275,7 @@ class DatagramDriver(Opened, Generic[Stream]):
         return readings
 
     def _datagrams(self) -> Iterator[tuple[bytes, int]]:
-        """Yield the sender's waiting datagrams, oldest first, with their arrival times, ns."""
+        """Yield waiting datagrams of accepted senders, oldest first, with arrival times, ns."""
         if self.link.state is LinkState.CLOSED:
             raise RuntimeError(f"the {self.name} link is not open")
         receiver = self._receiver or self._listen_again()
