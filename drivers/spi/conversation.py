@@ -44,7 +44,7 @@ _FROM_BRIDGE: Final = (Hello.TYPE, Sweep.TYPE, BridgeStatus.TYPE)
 
 
 class LineEvent(IntEnum):
-    """Kind of an event on a line, as passed to the tap and written to a link log."""
+    """Kind of an event on a line, as passed to `SerialLine.tap` and written to a link log."""
 
     RECEIVED = 1
     SENT = 2

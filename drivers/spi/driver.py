@@ -36,7 +36,8 @@ READS_MAX = 32
 DRAIN_TRIES, DRAIN_TRY_S = 10, 0.002
 """Number and length, s, of the waits for the last bytes to leave before a port is closed."""
 WRITE_TIMEOUT_S = 0.05
-"""Longest wait of a URL's port for room in its buffer, s; `poll` has just reported room."""
+"""Longest wait of a URL's port for room in its buffer, s. If it has a descriptor, `poll` has just
+reported room."""
 FAILURES = (OSError, termios.error, ValueError)
 """Exceptions of an open port; `ValueError`: a URL's port has a descriptor too high for `select`."""
 

@@ -25,7 +25,7 @@ SEQ_HALF, SEQ_END = 1 << 31, 1 << 32
 SEQ_FIRST_MAX = 1_000
 """Highest believed number of the first sweep after START.
 
-A higher one means that the bridge was sweeping before START; no sweep was lost then.
+A higher one means that the bridge was sweeping before START; then no sweep counts as missed.
 """
 DRIFT_MAX = 500e-6
 """Largest drift of a bridge's clock against the host's, as a share; more is a fault.
@@ -83,7 +83,7 @@ class BridgeCounters(FrameCounters):
     bridge_overruns: int = 0
     bridge_tx_dropped: int = 0
     bridge_rx_errors: int = 0
-    """Damaged frames that the bridge received.
+    """Damaged, overlong or unknown frames that the bridge received.
 
     Counters named `bridge_` are those of the last STATUS, since the bridge's reset.
     """
