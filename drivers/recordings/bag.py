@@ -116,7 +116,7 @@ class BagDriver(ReadingsDriver[Reading]):
         self.start(self._items())
 
     def read_ready(self) -> Sequence[Reading]:
-        """Return the next reading if it is due."""
+        """Return the next reading, alone, if it is due. Raises `RecordingError`."""
         taken = self.take()
         if taken is None:
             return ()
@@ -358,7 +358,7 @@ def fingers_of(path: Path) -> tuple[Finger, ...]:
 
 
 def has_joints(path: Path) -> bool:
-    """Return True if the bag has joint angles."""
+    """Return True if the bag has messages of joint states, whatever joints they name."""
     with _opened(path) as bag:
         return bag.joints is not None and bag.joints.msgcount > 0
 

@@ -117,7 +117,7 @@ class Survey:
     frames: Counter[tuple[str, int | None]] = field(default_factory=Counter)
     """Number of frames by bus and arbitration id; id None: CAN FD."""
     lacks_times: bool = False
-    """True if that line is a frame without a time, as `candump` alone shows it."""
+    """True if the line of `strange` is a frame without a time, as `candump` alone shows it."""
     has_steps: bool = False
     """True if times count from the line before (`candump -td`, ASC with relative times)."""
 

@@ -57,7 +57,7 @@ _COLOUR: Final = re.compile(r"\x1b\[[0-9;]*m")
 ANY_BUS: Final = "any"
 """Name of the bus for a loss on all buses."""
 NO_BUS: Final = ""
-"""Name of the bus for a line without a frame whose time matters."""
+"""Name of the bus for a line that has no frame, but a time that later ones count from."""
 
 
 class Logged(NamedTuple):

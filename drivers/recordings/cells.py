@@ -28,7 +28,7 @@ _SEPARATORS: Final = ",;\t|"
 _SEPARATOR_LINE: Final = re.compile(r"sep=(.)", re.IGNORECASE)
 """First line in which a spreadsheet program names the separator."""
 TITLE_LINES_MAX: Final = 30
-"""Most lines above the header, not counting blank ones."""
+"""Most lines above the header, not counting comments and blank ones."""
 
 
 class Cells:
@@ -44,7 +44,7 @@ class Cells:
         """`file`: opened, at its start."""
         self._path = path
         self.line = 0
-        """Number of the last line read, from 1; for Parquet, of the last row."""
+        """Number of the last line read, from 1. The rows of a Parquet file count from 2."""
         self.has_end = True
         """False after a last line without a line end."""
         self.decimal_comma = False
@@ -107,8 +107,8 @@ class Cells:
             raise self.error(f"this is not CSV: {error}") from error
 
     def _header(self, lines: Iterator[str]) -> tuple[str, list[str], Iterator[str]]:
-        """Return the separator, one line of the header or two, and the lines below. If no line at
-        the begin names electrodes, the header is the first line."""
+        """Return the separator, the one or two lines of the header, and the lines below. If no
+        line at the begin names electrodes, the header is the first line."""
         separator, comment, above, titles = "", "", "", list[tuple[int, str]]()
         header, below = list[str](), list[str]()
         while not header and len(titles) <= TITLE_LINES_MAX and (line := next(lines, "")):
@@ -151,7 +151,7 @@ class Cells:
         return line, chain(self._again(held), lines)
 
     def _again(self, held: Sequence[tuple[int, bool, str]]) -> Iterator[str]:
-        """Yield lines that were read before, with their number and whether they have an end."""
+        """Yield the lines of `held`, which were read before; set `line` and `has_end` to theirs."""
         for number, has_end, line in held:
             self.line, self.has_end = number, has_end
             yield line

@@ -140,7 +140,7 @@ class Columns:
     degrees: tuple[str, ...]
     """Names of joints' angles in degrees; those that are in radians too are not among them."""
     unclear: tuple[str, ...]
-    """Names that may be of the angle of a joint, of which no other is known."""
+    """Names that may be a joint's angle, of joints whose angle no other column clearly is."""
     time: TimeColumn | None
     object: int | None
     slipped: int | None
@@ -363,7 +363,7 @@ def _nearest(names: Sequence[str]) -> str:
 
 
 def time_column(names: Sequence[str]) -> TimeColumn | None:
-    """Return the column of times: `t`, else the first of a usual name or unit; None without any."""
+    """Return the column of times: `t`, else the first usual name, else unit; None without any."""
     found = [(place, match) for place, name in enumerate(names) if (match := _is_time(name))]
     found = found or [
         (place, match) for place, name in enumerate(names) if (match := _IN_UNIT.fullmatch(name))

@@ -86,9 +86,9 @@ class Layout:
     rate_hz: float | None = None
     """Sweeps per second, in place of times."""
     has_outcomes: bool = False
-    """True for a table with outcomes, or a stream, which may begin without, with their column."""
+    """True for a table with outcomes; for a stream, if it has their column, even if still blank."""
     unread_outcome: str = ""
-    """Why an outcome cannot be read, in a file of which none can; empty: some can, or are blank."""
+    """Why the first outcome cannot be read, if none seen can; empty: one can, or there are none."""
 
     @property
     def joints(self) -> Mapping[str, int]:
@@ -175,7 +175,7 @@ class _Rows:
         self._others = _until_damage(each)
         self.first = [*first, *islice(self._others, BLOCK_ROWS - 1)]
         self._named = set[str]()
-        """Fingers of rows, one more at most than there are."""
+        """Words in the column `finger`; at most one more than hands have fingers."""
         self._note_fingers(self.first)
 
     def refuse_values(self) -> None:

@@ -51,7 +51,7 @@ class RecordedDriver(Opened, Generic[Item]):
         self.exhausted = False
         """True after the last item or an error, until `start`."""
         self.handed_over_ns = self._opened_ns = clock()
-        """Time when the last reading was handed over, ns; the judge's now."""
+        """Time when the last reading was handed over, ns, which the judge uses as now."""
         self._clock = clock
         self._playing: Generator[tuple[int, Item], None, None] | None = None
         self._next: tuple[int, Item] | None = None
@@ -201,7 +201,7 @@ class LinkLogDriver(RecordedDriver[Item]):
         return None if recorded_ns is None else round(recorded_ns / (self.speed or 1.0))
 
     def open(self) -> None:
-        """Start from the first file."""
+        """Start from the first file. Raises `RecordingError`, also if no file has a record."""
         self.close()
         for path in self.paths:
             open_recording(path).close()

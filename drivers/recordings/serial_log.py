@@ -21,7 +21,7 @@ from graspd.drivers.spi.conversation import Conversation, LineEvent
 from graspd.drivers.spi.messages import FrameCounters, FrameParser, encode_frame
 
 PIECE_MAX_BYTES: Final = 960
-"""Most bytes of one record; a frame has at most 1024. Longer pieces are cut."""
+"""Most bytes of one record; a frame has at most 1024. Longer reads take several records."""
 
 CHUNK_BYTES: Final = 4096
 

@@ -162,5 +162,5 @@ def _looks_like(wrong: Sequence[str], *, decimal_comma: bool) -> str:
 
 
 def shown(cell: str) -> str:
-    """Return a cell in quotes, for a message."""
+    """Return the first `SHOWN_LENGTH_MAX` characters of a cell in quotes, for a message."""
     return repr(cell if len(cell) <= SHOWN_LENGTH_MAX else cell[:SHOWN_LENGTH_MAX] + "...")
