@@ -203,7 +203,7 @@ class Assembler:
 
 ALL = [range(24)]
 PALM_SHIFT = 37
-"""Packets skipped by a restart of what sends the palm's packets; it begins within a round."""
+"""Packets that a restart of the palm skips: no multiple of 14, so it begins within a round."""
 PAIRS = [[], [0], *([first, first + 1] for first in range(1, 22, 2)), [23]]
 """Electrodes of each request of a round (tactile_data_type 0x0001, 0x0003 ... 0x001B)."""
 

@@ -30,7 +30,7 @@ PERIOD_NS = 10_000_000
 JOINTS = ("FFJ3", "MFJ3", "THJ5", "FFJ2", "MFJ2", "THJ2")
 FINGERS = ("ff", "mf", "th")
 ROWS = 300
-"""Rows of the demo that hold one grasp."""
+"""Number of first rows of the demo, which hold one grasp."""
 
 
 def demo() -> pd.DataFrame:
@@ -303,7 +303,7 @@ def test_the_joints_of_the_other_hand_are_left_out(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("prefix", ["", "rh_", "RH_"])
-def test_joints_in_a_bag_are_known_in_any_case(tmp_path: Path, prefix: str) -> None:
+def test_joint_names_in_a_bag_may_have_any_letter_case(tmp_path: Path, prefix: str) -> None:
     angles = {prefix + "FFJ3": 0.5, prefix + "thj5": 0.7, "LH_THJ2": 0.1}
     path = BagOf(1).write(tmp_path / "hand.bag", [noise(1)[0]._replace(angles=angles)])
     frame = read_recording(path)

@@ -186,7 +186,7 @@ def test_a_unit_of_times_other_than_seconds_is_logged(
         assert [record.getMessage().split()[-1] for record in caplog.records] == unit
 
 
-def test_a_table_without_a_readable_outcome_says_so_once(
+def test_a_table_without_a_readable_outcome_logs_one_warning(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     content = table(2, {0: {"slipped": "yes"}, 1: {"slipped": "no"}})

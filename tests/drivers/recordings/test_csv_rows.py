@@ -154,7 +154,7 @@ def test_outcomes_of_which_only_a_part_is_readable_are_refused(
     assert told in refusal(table(600, changes))
 
 
-def test_unreadable_outcomes_alone_are_unknown_unless_needed() -> None:
+def test_outcomes_all_unreadable_are_unknown_or_refused_if_required() -> None:
     content = table(3, {0: {"slipped": "yes"}, 1: {"slipped": ""}, 2: {"slipped": "no"}})
     assert [row.annotation.slipped for row in rows_of(content)] == [None] * 3
     with pytest.raises(RecordingError, match=r"line 2, column slipped: 'yes' is not an outcome"):
@@ -321,7 +321,7 @@ def test_values_that_are_not_counts_are_refused_with_a_guess(content: bytes, sai
     assert said in message
 
 
-def test_half_unread_or_a_twentieth_scaled_values_are_allowed() -> None:
+def test_up_to_half_unreadable_or_a_twentieth_scaled_values_pass() -> None:
     for cell, most, of in (("x", 10, 20), ("1.5", 1, 20), ("-2", 1, 20), ("-1", 1, 2)):
         allowed, counts = [cell] * most, ["2000"] * (of - most)
         assert problem_with([*allowed, *counts, "", ""], decimal_comma=False) is None
@@ -366,7 +366,7 @@ def test_joints_named_in_degrees_are_refused_in_streams_only(name: str) -> None:
         (["rh_FFJ3_current_position"], (), ("rh_FFJ3_current_position",)),
     ],
 )
-def test_angles_of_joints_are_known_by_what_columns_say(
+def test_column_names_tell_joint_angles_from_other_values(
     names: Sequence[str], joints: Sequence[str], unclear: Sequence[str]
 ) -> None:
     content = stream(TIMES, {name: ["0.1"] * 4 for name in names})

@@ -95,7 +95,7 @@ def test_a_name_in_quotes_may_have_line_breaks() -> None:
 @pytest.mark.parametrize(
     ("change", "line"), [(("ff_biotac_1,", '"ff\nbiotac\n1",'), 4), (("", '5"\n'), 3)]
 )
-def test_rows_keep_their_lines_below_quotation_marks(change: tuple[str, str], line: int) -> None:
+def test_line_numbers_are_true_below_a_quotation_mark(change: tuple[str, str], line: int) -> None:
     rows = rows_of(text(lambda it: it.replace(*change, 1)))
     assert [row.annotation.line for row in rows] == [line, line + 1, line + 2, line + 3]
 

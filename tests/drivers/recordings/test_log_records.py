@@ -233,7 +233,7 @@ def test_damaged_records_are_counted_and_the_first_is_located(
     assert "2 of 200 records were damaged; the first is before byte 12288" in caplog.text
 
 
-def test_a_record_of_a_time_beyond_64_bits_is_refused(tmp_path: Path) -> None:
+def test_a_record_whose_time_is_too_late_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "line.serial"
     path.write_bytes(encoded([(2**64 - 1, (LineEvent.RECEIVED, b"a"))]))
     with pytest.raises(RecordingError, match=r"line.serial: the time 18446744073.7 s is later"):

@@ -71,7 +71,7 @@ def test_the_unit_of_times_is_known_by_step_or_size(
         *(([1] * 10, "most rows have the time of the row before"), ([1] * 9, None)),
     ],
 )
-def test_times_of_a_stream_rise_by_less_than_a_second(
+def test_slow_falling_or_standing_times_are_refused_beyond_limits(
     tmp_path: Path, times: Sequence[float], said: str | None
 ) -> None:
     path = write(tmp_path, stream([f"{t:g}" for t in times]))
