@@ -59,7 +59,7 @@ SWEEPS_PER_BOOT = 700
 """Number that each restart of a board adds to the numbers of its sweeps."""
 
 Feed = Callable[[Unit, int, int], Sequence[Reading]]
-"""Function that gives a driver a unit, of the sweep of this number, at this time in ns."""
+"""Give a driver a unit, with the number of its sweep and the time, ns; return the readings."""
 Link = tuple[Feed, DriverCounters]
 COPIES = ("duplicates", "duplicate_frames", "duplicate_packets", "old_messages")
 """Names of the links' counters of repeated units."""
