@@ -103,7 +103,7 @@ class TactileReading(msgspec.Struct, frozen=True, eq=False, gc=False):
 
 
 class JointReading(msgspec.Struct, frozen=True, eq=False, gc=False):
-    """Joint angles of a hand at one time; times and `seq` are as in `TactileReading`."""
+    """Joint angles of a hand at one time. Fields are as in `TactileReading`; `seq` is 0 in bags."""
 
     t_ns: int
     seq: int
