@@ -24,7 +24,8 @@ from graspd.models.training.systems.registry import SYSTEMS, System
 
 
 class WrongInputError(Exception):
-    """The command line names a missing file, system or table, or does not fit the data."""
+    """The command line has an unknown name or options that exclude each other, or does not fit the
+    data, or an extra or a file that it needs is missing."""
 
 
 def whole(low: int, high: int) -> Callable[[str], int]:

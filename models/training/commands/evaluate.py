@@ -76,7 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Evaluate; finished trainings are kept and not run again.
+    """Evaluate, or print the systems for `--list`; trainings in `--out` are not run again.
     Returns 0, 1 (a worker was lost), 2 (input or folder), 130 (Ctrl-C). Raises `ModelError`."""
     if args.list:
         from graspd.models.training.systems.explained import TITLES, explained

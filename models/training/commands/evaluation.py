@@ -95,7 +95,8 @@ def evaluate(args: argparse.Namespace) -> None:
 
 @contextmanager
 def _cluster(address: str) -> Iterator[None]:
-    """Run trainings on the cluster of the Dask scheduler at this address, within the block."""
+    """Run trainings on the cluster of the Dask scheduler at this address, within the block.
+    Raises `WrongInputError` without extra or scheduler, `LostWorkerError` for a lost training."""
     try:
         from distributed import Client, KilledWorker
     except ModuleNotFoundError as error:
@@ -159,7 +160,8 @@ def _evaluated(
     grasps: Grasps,
     args: argparse.Namespace,
 ) -> list[Figures]:
-    """Run all jobs. Write and print the rows of a system in a protocol once these are complete."""
+    """Run all jobs; return the figures of each system in each protocol. Their rows are written, and
+    the figures printed, once all their jobs are done."""
     groups = {
         (system.name, protocol): jobs_of(system, protocol, grasps, _seeds(args), folds)
         for system in systems

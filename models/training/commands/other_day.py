@@ -105,8 +105,9 @@ def _judge_of(trained: Trained) -> GraspJudge:
 
 
 def _figures(model: _Model, day: Grasps) -> dict[str, Any]:
-    """Judge the grasps of a table in order, from an empty session; return `verdict_figures` of
-    those not refused, names, numbers and F1's 95 % interval. Warns of grasps trained on."""
+    """Judge a table's grasps in order, from an empty session; warn of those trained on. Return
+    `verdict_figures` of those not refused, the names `table` and `model`, the numbers of grasps
+    `all` and `trained_on`, and `f1_interval`, 95 %; None: no slip, judged or real."""
     table = day.files[0].name
     try:
         day = day.of_fingers(model.fingers)

@@ -121,7 +121,7 @@ def _train(args: argparse.Namespace) -> None:
 
 
 def _plan(args: argparse.Namespace, lab: tuple[str, ...]) -> TrainingPlan:
-    """Return the plan of the command line; `lab`: names of its own tables, as the grasps have."""
+    """Return the plan of the command line; `lab`: names of the tables that are not published."""
     from graspd.models.training.making.plan import TrainingPlan
 
     system = SYSTEMS[args.model]

@@ -48,7 +48,7 @@ trained on all its grasps 0.59 or more, and 0.96 or more on itself."""
 STANDARD_ERRORS = 2.0
 """Fewest standard errors between a reversed network's area and one half, that of chance."""
 LINEAR = frozenset({"Add", "Gemm", "MatMul"})
-"""Last operators of logits: only weak ones lie in 0..1, and by chance."""
+"""Last operators of networks that return logits. After these, answers lie in 0..1 by chance."""
 SHAPING = frozenset({"Cast", "Flatten", "Identity", "Reshape", "Squeeze", "Unsqueeze"})
 """Operators that do not change values."""
 ON_TABLE = "Measured on its own table alone: its worth on other objects and days is not known."
@@ -165,7 +165,8 @@ def _session(network: bytes) -> Any:  # noqa: ANN401 - onnxruntime has no types
 
 
 def _with_ends(source: Path, network: bytes, grasps: Grasps) -> onnx.ModelProto:
-    """Return the network with the daemon's input and output. Raises `ModelError`."""
+    """Return the network with the daemon's input and output. Raises `ModelError` for other shapes,
+    answers that are not logits (or, of two, probabilities), or reversed classes."""
     check_operators(source, network)  # onnxruntime would look for weights in the current folder
     fingers = len(grasps.fingers)
     session = _session(network)
@@ -221,7 +222,8 @@ def _answers(
 
 def _last(answer: str, read: NDArray[np.float32], graph: onnx.GraphProto) -> list[onnx.NodeProto]:
     """Return the nodes that convert the network's output `answer` to two probabilities; add their
-    constants to `graph`. `read`: answers on the table, which show the form of the output."""
+    constants to `graph`. `read`: answers on the table, which show the form of the output. Raises
+    `ModelError` if they are not finite, or like probabilities but not two that add up to 1."""
     if not np.isfinite(read).all():
         raise ModelError("the network answers grasps of the table with values that are not numbers")
     two = np.array([-1, read.shape[-1]], np.int64)
@@ -258,7 +260,7 @@ def _last_operator(answer: str, graph: onnx.GraphProto) -> str:
 
 
 def _check_order(read: NDArray[np.float32], slipped: NDArray[np.bool_]) -> None:
-    """Raise `ModelError` if answers rise as grasps hold, and by more than chance.
+    """Raise `ModelError` if grasps that held have the higher answers, by more than chance.
 
     `read`: answers to grasps, shape (N, 1) or (N, 2). `slipped`: outcomes, shape (N,)."""
     from sklearn.metrics import roc_auc_score

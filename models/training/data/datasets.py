@@ -164,11 +164,11 @@ def read_all(folder: Path) -> Grasps:
 def read_with_lab_tables(
     folder: Path | None, lab: Sequence[Path], read_as: ReadAs | None = None
 ) -> Grasps:
-    """Return the published tables of `folder`, if given, then each lab table.
+    """Return the published tables of `folder`, if given, then each lab table, the user's own.
 
     Raises `DatasetError` for a file that is not a grasp table. A lab table is also refused if it
-    has the name of another, repeats a grasp, has only one label, or under `FEWEST_GRASPS` grasps.
-    Raises `ValueError` if there is neither a folder nor a lab table.
+    has the name of another or of a published one, has the exact counts of another grasp, only one
+    label, or under `FEWEST_GRASPS` grasps. One of `folder` and `lab` must be given.
     """
     parts = [] if folder is None else [read_all(folder)]
     paths: dict[str, Path] = {}
@@ -202,7 +202,7 @@ def concatenate(parts: Sequence[Grasps]) -> Grasps:
 
 
 def unpublished(files: Sequence[Dataset]) -> list[str]:
-    """Return the names of files that differ from every published table."""
+    """Return the names of files without both name and content of a published table."""
     published = {(table.name, table.sha256) for table in TABLES}
     return [file.name for file in files if (file.name, file.sha256) not in published]
 
@@ -261,7 +261,8 @@ def first_readings(counts: NDArray[np.uint16]) -> Ints:
 
 
 def check_once(grasps: Grasps, lab: Mapping[str, Path]) -> None:
-    """Raise `DatasetError` if a lab table repeats a grasp, as training and test would share it.
+    """Raise `DatasetError` if a lab table has the exact counts of an earlier grasp, which training
+    and test could share.
 
     `lab`: path of each lab table by its name.
     """

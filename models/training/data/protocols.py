@@ -61,7 +61,8 @@ class Split:
 
 
 def splits(protocol: EvalProtocol, grasps: Grasps, seed: int, folds: int = FOLDS) -> list[Split]:
-    """Return a split for each fold of a protocol; `unknown` has one, `days` folds for each day.
+    """Return a split for each fold of a protocol; `unknown` has one, `days` at most `DAYS_FOLDS`
+    for each of `DAYS`.
 
     Raises `TooFewGraspsError` if the data lack a table, objects or grasps.
     """

@@ -93,7 +93,8 @@ class Day:
         return 0 if self.judge_of.session is None else self.judge_of.session.grasps
 
     def judge(self, counts: NDArray[np.uint16]) -> tuple[float, bool]:
-        """Return log-odds of slip and True if refused; then learn from the grasp."""
+        """Return log-odds of slip, also of a refused grasp, and True if it is refused; then let the
+        session take the grasp in."""
         examined = self.judge_of.examine(counts)
         opinion = self.judge_of.judge(examined)
         if opinion.refusal is not None:
@@ -114,7 +115,7 @@ class TrainedNetwork:
         """Log-odds of slip of the last run."""
 
     def run(self) -> tuple[float, float]:
-        """Return the probabilities (stable, slip) for `input`."""
+        """Return the probabilities (stable, slip) for `input`, and set `margin`."""
         (self.margin,) = self._fitted.margins(self.input[np.newaxis]).tolist()
         p_slip = sigmoid(self.margin)
         return 1.0 - p_slip, p_slip

@@ -72,8 +72,9 @@ def judged(job: Job, grasps: Grasps) -> pd.DataFrame:
 
     Columns: `variant`; `grasp`, its index in `grasps`; `margin`, the uncalibrated log-odds of slip;
     `refused`, true if the daemon would call it `unknown` (missing except in `days`); `age`, the
-    grasps that its running session had before. The training has `fold_name`, `train_grasps`,
-    `parameters` (numbers that the trained system consists of) and `seconds` (with judging).
+    grasps that its running session had before. Columns of the training, the same in all rows:
+    `fold_name`, `train_grasps`, `parameters` (numbers that the trained system consists of) and
+    `seconds` (with judging).
 
     The result depends on the arguments alone. Raises `TooFewGraspsError` if the data
     lack that split, `ValueError` if the system cannot learn from it.
@@ -152,7 +153,7 @@ def evaluated(
 
 @contextmanager
 def processes(number: int) -> Iterator[None]:
-    """Run trainings in processes of this computer, which end with the block.
+    """Run `number` trainings at once, in processes that end with the block; 1: in this process.
     Raises `LostWorkerError` if one is killed."""
     try:
         with joblib.parallel_config("loky", n_jobs=number, initializer=_leave_ctrl_c):

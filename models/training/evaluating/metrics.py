@@ -107,7 +107,7 @@ def cross_fitted(rows: pd.DataFrame) -> pd.Series:
     """Return the slip probability of each row; `rows` are of one seed and variant.
 
     Each fold is calibrated by a temperature fitted to the other folds; of a single fold, each
-    object by one fitted to the other objects.
+    object by one fitted to the other objects, and a single object not at all.
     """
     group_of = rows["fold"] if rows["fold"].nunique() > 1 else rows["object"]
     probability = pd.Series(np.nan, rows.index)

@@ -53,7 +53,8 @@ class Trained:
     for other systems."""
 
     def margins(self, counts: Numbers, table_of: Ints) -> Floats:
-        """Return uncalibrated log-odds of slip (N,) of counts (N, fingers, 24) and tables (N,)."""
+        """Return uncalibrated log-odds of slip (N,) of counts (N, fingers, 24) and tables (N,).
+        Raises `KeyError` if a session system was not trained on one of these tables."""
         return self.fitted.margins(_inputs(self.system, self.standards, counts, table_of))
 
     def mapped(self, counts: Numbers, table_of: Ints) -> Floats:

@@ -67,7 +67,8 @@ OWN_LICENCE = "whatever the owner of the tables says"
 def make_model(
     plan: TrainingPlan, grasps: Grasps, out: Path, on_done: Callable[[], None]
 ) -> ModelContract:
-    """Write `NAME.onnx` and its card `NAME.json` into `out`, which keeps the trainings too.
+    """Write `NAME.onnx` and its card `NAME.json` into `out`, which keeps the trainings too; return
+    its contract.
 
     `grasps`: grasps of all given tables. `on_done`: called after each of the plan's
     jobs and of the `EXTRA_TRAININGS`. Raises `TooFewGraspsError` if the grasps are too few for the
@@ -179,7 +180,8 @@ def _sharpness(measured: list[Figures]) -> tuple[Sharpness, ...]:
 def _never_seen(trained: Trained, contract: ModelContract, seed: int) -> dict[str, object]:
     """Return the fractions of readings that the contract's `seen` refuses.
 
-    `held_out_object`: fraction of an object's grasps refused by the other objects' training.
+    `held_out_object`: fraction of all grasps refused if their object is not trained on; None if one
+    object has all grasps, or all but one.
     `made_up`: fraction of synthetic readings before any repair, by the way they were made.
     """
     grasps, seen = trained.grasps, contract.seen

@@ -62,8 +62,9 @@ class TrainingPlan:
         return re.sub(r"[^A-Za-z0-9._]+", "-", words)[:NAME_MAX].rstrip("-.")
 
     def protocols(self, grasps: Grasps) -> tuple[EvalProtocol, ...]:
-        """Return the protocols of the measurement: `only` if set; else `cv`, new objects, which
-        calibrate the probabilities, and, with all published tables, `session` and `days`."""
+        """Return the protocols of the measurement: `only` if set; else `cv`, then `objects` or
+        `objects-whole`, which calibrates probabilities; with all published tables also `session`
+        and `days`."""
         if self.only is not None:
             return (self.only,)
         there = {file.name for file in grasps.files}

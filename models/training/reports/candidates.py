@@ -1,4 +1,4 @@
-"""Candidates of the report and their run times: graspd's models, and the published code of `cnn1`.
+"""Candidates of `report error-vs-time`, timed: graspd's models, and the published code of `cnn1`.
 
 The published network is not trained here, because its time does not depend on its weights. Steps
 are timed in a hot loop and paced, one candidate after the other in every round.
@@ -176,7 +176,7 @@ def _hot(steps: Mapping[str, Step], readings: int) -> dict[str, list[int]]:
 def _paced(
     steps: Mapping[str, Step], readings: int
 ) -> tuple[dict[str, list[int]], dict[str, list[int]]]:
-    """Return wall and processor times by step, ns, of readings 10 ms apart."""
+    """Return wall and processor times by step, ns: a step every 10 ms, all in turns."""
     wall: dict[str, list[int]] = {name: [] for name in steps}
     cpu: dict[str, list[int]] = {name: [] for name in steps}
     due_s = time.perf_counter()

@@ -81,7 +81,8 @@ Report = dict[str, Any]
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure run times; write and print the report. Raises `DatasetError` or `ModelError`."""
+    """Measure run times; write and print the report. Raises `DatasetError`, `ModelError`, `OSError`
+    or, for a page without one such table, `WrongInputError`."""
     grasps = read_all(args.data)
     page = None if args.page is None else args.page.read_text()
     if page is not None and len(PAGE_TABLE.findall(page)) != 1:

@@ -66,7 +66,7 @@ def reliability(learning: pd.DataFrame, scales: dict[tuple[int, int], float]) ->
 
     `parts`: for grasps with a `p_slip` from `low` to `high`, its mean (`said`) and the share that
     `slipped`. `slope`: of all grasps. `sessions`: quantiles `SPREAD` of single sessions' slopes.
-    `shipped`: the learner's own scale.
+    `scales`: those given, `shipped`: the learner's own.
     """
     rows = after_outcomes(learning)
     parts = [

@@ -54,7 +54,7 @@ def streams(
     """Train the networks of each day and fold; yield the streams of the three tables.
 
     Objects are split `seeds` times; `folds` of each are judged. `epochs` None: the systems' own.
-    `on_day` is called before each day's training.
+    `on_day` is called with a text before the trainings of each of `DAYS`, in each fold.
     """
     systems = [SYSTEMS[name] for name in (OWN, PUBLISHED)]
     if epochs is not None:

@@ -139,7 +139,7 @@ def worth_of(several: Sequence[Stream], command: str) -> Figures:
 
 
 def limits(share: float, warm_up: int = WARM_UP) -> RiskLimits:
-    """Return the limits of a scene that allows this share of slips, with this warm-up, outcomes."""
+    """Return the limits of a scene with this allowed share of slips and `warm_up`, in outcomes."""
     return RiskLimits(share, warm_up, EXPLORE)
 
 

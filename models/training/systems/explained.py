@@ -34,7 +34,8 @@ MINUTES = {
 
 
 def explained() -> Iterator[tuple[str, ...]]:
-    """Yield a row for each system and place in the paper, with a cell for each of `TITLES`."""
+    """Yield a row for each protocol in which the paper has a system, one of `cv` for other systems;
+    cells as in `TITLES`."""
     for name, system in SYSTEMS.items():
         words = layers(system.estimator), taken(system)
         rows = {figure.protocol: figure.place for figure in system.published} or {"cv": "-"}

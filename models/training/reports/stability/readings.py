@@ -48,7 +48,7 @@ def two_levels(lows: tuple[int, ...], step: float) -> Callable[[Raw], Counts]:
 
 
 def one_far_off(likely: Raw) -> Counts:
-    """Return readings with one electrode, each in turn, far from the others, at three levels."""
+    """Return readings with one electrode of every finger far off: each in turn, at three levels."""
     counts = np.repeat(two_levels((2000,), 1)(likely), 3 * ELECTRODES, axis=0)
     for electrode in range(ELECTRODES):
         counts[3 * electrode : 3 * electrode + 3, :, electrode] = [[1], [1000], [COUNT_MAX - 1]]
