@@ -77,7 +77,8 @@ class Felt:
 
     @property
     def revoked_ms(self) -> float | None:
-        """Time from the slide's begin to the verdict's end, ms; None: no verdict stood then."""
+        """Time from the slide's begin to the end of the verdict, at most of the hold, ms; None: no
+        verdict stood then."""
         stands = self.stands[self.slides_at :]
         if not self.stands[self.slides_at - 1]:
             return None

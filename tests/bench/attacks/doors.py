@@ -74,7 +74,7 @@ class Plan:
     """Folder for files and sockets; removed afterwards."""
 
     def rounds(self) -> Iterator[int]:
-        """Yield 0, 1, 2 ... until `seconds` are over; at least 0."""
+        """Yield 0, 1, 2 ... until `seconds` are over, at least once."""
         end_s = time.monotonic() + self.seconds
         tried = 0
         while tried == 0 or time.monotonic() < end_s:
@@ -103,7 +103,8 @@ class Outcome:
 
 @dataclass(slots=True)
 class Hand:
-    """A daemon under attack, its endpoints, and a subscriber that does no harm, its `friend`."""
+    """A daemon under attack, its endpoints, a subscriber that does no harm (`friend`), and
+    the daemon's memory before the attack, MiB."""
 
     process: Child
     publish: str

@@ -71,7 +71,7 @@ def test_a_wrapped_network_judges_separable_grasps_rightly(
 def wrapped(
     folder: Path, network: torch.nn.Module, shape: tuple[int, ...], axes: tuple[int, ...] = (0,)
 ) -> str:
-    """Return what is said of wrapping a network; `axes`: those of its input of any length."""
+    """Return what wrapping a network prints, or its error; `axes`: input axes of any length."""
     path = folder / "other.onnx"
     free = {"counts": {axis: f"n{axis}" for axis in axes}}
     torch.onnx.export(
@@ -125,11 +125,11 @@ RIGHT = {
     "one answer to all": (rising(0.0, bias=0.5), 66.7),
     "one pair of logits to all": (rising(0.0, 0.0, bias=0.2), 66.7),
 }
-"""Networks with their F1: `slip` of all grasps, half of which slipped, has 2/3."""
+"""Networks with their F1, %. Half of the grasps slipped: calling all of them `slip` has 2/3."""
 
 
 @pytest.mark.parametrize(("network", "f1"), RIGHT.values(), ids=RIGHT)
-def test_a_network_of_slips_is_wrapped_however_weak(
+def test_log_odds_logits_and_probabilities_are_wrapped_even_if_weak(
     folder: Path, network: torch.nn.Module, f1: float
 ) -> None:
     assert f"F1 {f1} % on the table itself" in wrapped(folder, network, (1, 72))
@@ -206,7 +206,7 @@ def test_weights_in_another_file_are_refused_with_advice(
         assert "external_data=False" in done.stderr
 
 
-def test_a_network_refused_by_the_trial_is_named_itself(
+def test_a_refusal_by_the_trial_names_the_users_file(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def too_slow(path: Path) -> None:

@@ -31,7 +31,7 @@ from tests.models.training.samples import (
 STABLE_AND_SLIP = {"palm_down": (667, 609), "palm_side": (603, 670), "palm_45": (1058, 1075)}
 """Grasps of each table, as recorded when the data was taken in."""
 CARD = {table["name"]: table for table in zoo.card("small-session")["contract"]["datasets"]}
-"""Tables as the card has them of the model that was made of them."""
+"""Published tables by name, as listed in the card of `small-session`, which is made of them."""
 
 
 def test_a_published_table_is_read_whole(bts3_dir: Path) -> None:
