@@ -166,7 +166,8 @@ def _mlp_margins(model: MLPClassifier, inputs: Floats32) -> Floats:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Limit libraries to one thread, because sums over more threads round differently."""
+    """Limit libraries to one thread, because sums over more threads round differently.
+    Raises `KeyboardInterrupt` on Ctrl-C also where scikit-learn only warns."""
     with threadpool_limits(1), warnings.catch_warnings():
         # The warning that a perceptron did not converge: its number of epochs is a setting here.
         warnings.filterwarnings("ignore", category=ConvergenceWarning)

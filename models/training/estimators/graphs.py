@@ -42,7 +42,8 @@ class Fitted(Protocol):
         """Return the graph from inputs (N, *shape) to `margin` (N, 1)."""
 
     def to_onnx(self, temperature: float, input_name: str) -> onnx.ModelProto:
-        """Return the graph from inputs to `probability` (N, 2): sigmoid(margin / temperature)."""
+        """Return the graph from inputs to `probability` (N, 2) of stable and slip; that of slip is
+        sigmoid(margin / temperature)."""
         return with_probability(self.margin_graph(input_name), temperature)
 
 
@@ -65,7 +66,8 @@ def weighted_sum(parts: Sequence[onnx.ModelProto], factors: Sequence[float]) -> 
 
 
 def with_probability(margin: onnx.ModelProto, temperature: float) -> onnx.ModelProto:
-    """Return a margin's graph with output `probability` (N, 2): 1 - p, p = sigmoid(margin / T)."""
+    """Return a margin's graph with output `probability` (N, 2): (1 - p, p) for
+    p = sigmoid(margin / temperature)."""
     # softmax(-m / 2T, m / 2T) is 1 - sigmoid(m / T), sigmoid(m / T).
     share = np.array([[-0.5, 0.5]]) / temperature
     nodes = nodes_of(
@@ -157,7 +159,7 @@ def vector_model(
     input_name: str,
     width: int,
 ) -> onnx.ModelProto:
-    """Return the graph from vectors (N, width) to their margin."""
+    """Return the graph of nodes that compute `margin` (N, 1) from vectors (N, width)."""
     given = helper.make_tensor_value_info(input_name, FLOAT, ["N", width])
     return _model(nodes, constants, given, MARGIN_NAME, 1)
 

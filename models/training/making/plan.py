@@ -47,9 +47,9 @@ class TrainingPlan:
     It is for a model that is only compared with others. None: all protocols.
     """
     lab_files: tuple[str, ...] = ()
-    """File names of the lab tables that are trained on, with their endings."""
+    """File names of the user's own tables that are trained on, with their endings."""
     name: str | None = None
-    """Name of the model; None: made from the system and its lab tables."""
+    """Name of the model; None: made from the names of the system and of the user's own tables."""
 
     @property
     def model(self) -> str:

@@ -52,7 +52,7 @@ THRESHOLD_PAIRS, BISECTIONS = 12, 40
 def rows(name: str, data: Path | None = None) -> Iterator[Row]:
     """Yield the rows of a model of the zoo; `data`: folder of the published tables.
 
-    Without onnx nothing is compared with the reference of the network.
+    Without onnx the network has no reference, and the rows lack `network`, `p_slip` and `flips`.
     """
     model = TactileModel(zoo.find(name))
     reference = Reference(model.path) if find_spec("onnx") else None

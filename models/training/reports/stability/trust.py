@@ -120,7 +120,8 @@ def rows(outcomes: int) -> Iterator[Row]:
 
 
 def learner_row(outcomes: int) -> Row:
-    """Report `outcomes` of all streams in turns to a learner; check its covariance."""
+    """Have a learner take in this number of outcomes, of all streams in turns; return figures of
+    its weights and their covariance."""
     random, learner = np.random.default_rng(0), Learner(INPUTS)
     streams = [stream(random) for stream in STREAMS.values()]
     eigenvalues, variances, means, asymmetric = [], [], [], 0
@@ -153,7 +154,8 @@ def learner_row(outcomes: int) -> Row:
 
 
 def beyond_the_bound(alpha: float, late: int, slips_from: float) -> float:
-    """Return by how many slips an adversary that knows the rule and its budget exceeds the bound.
+    """Return by how many slips an adversary that knows the rule and its budget exceeds the bound;
+    at most 0: the bound holds.
 
     It lifts the surest grasps, which hold until the budget is at `slips_from` slips, and slip from
     then on. Outcomes come `late` at a time. `alpha`: allowed share of slips.
