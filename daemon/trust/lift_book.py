@@ -82,9 +82,9 @@ class Lift(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     slipped: bool | None = None
     """Outcome: True for a slip. None: not known yet."""
     announced: bool = False
-    """True once a `lift` question was answered yes, and the grasp was called `stable`."""
+    """True if a `lift` question was answered yes for this `stable` grasp, and not taken back."""
     owner: Peer | None = None
-    """First peer that was answered that it may lift the grasp; None: no peer yet."""
+    """First peer that was answered that it may lift the grasp; None: no peer, or taken back."""
 
     @property
     def is_outstanding(self) -> bool:
@@ -124,9 +124,10 @@ class LiftBook:
         """Called with True after `announce` changed anything of a grasp, with False after its
         announcement was taken back. A recording has these calls, so its replay learns the same."""
         self._judged: tuple[GraspId, bytes] | None = None
-        """Grasp judged last, and its features when it was judged last after settling."""
+        """Grasp noted last, and the features that an offer takes: of its last judgement after
+        settling, or of a later first `stable` verdict. None: none since a start or exchange."""
         self._offered: GraspId | None = None
-        """Grasp that was offered last; None: no grasp since the start."""
+        """Newest grasp at the last `announce`; None: no grasp since the start."""
         self._unkept: set[GraspId] = set()
         """Grasps whose outcome was accepted and is not on the disk yet."""
         self.told: Counter[OutcomeStatus] = Counter()
@@ -136,7 +137,7 @@ class LiftBook:
         self.outstanding = 0
         """Number of grasps called `stable` whose outcome can still come."""
         self.announced = 0
-        """Number of lifts that were announced."""
+        """Number of lifts that were announced and not taken back."""
         self.awaited = 0
         """Number of announced lifts without an outcome."""
 
@@ -211,8 +212,9 @@ class LiftBook:
     def announce(self) -> None:
         """Note that a `lift` question about the newest grasp was answered yes.
 
-        Its outcome teaches what was judged last after settling: the hand may have pressed harder
-        since the first judgement. It is announced, once, if it was ever called `stable`.
+        Its outcome teaches the last judgement after settling, or a later first `stable` verdict:
+        the hand may have pressed harder since. It counts as announced, once, if it was ever called
+        `stable`. Nothing changes if its outcome is known.
         """
         lift = next(reversed(self._lifts.values()), None)
         if lift is None or lift.slipped is not None:
@@ -234,7 +236,7 @@ class LiftBook:
         """Note that no lift of a grasp follows, and remove its owner. None: the newest announced
         grasp without outcome.
 
-        Return False, and change nothing, if its outcome is known or the grasp is not in the book.
+        Return False, and change nothing, if its outcome is known or there is no such grasp here.
         """
         awaited = (lift for lift in reversed(self._lifts.values()) if lift.is_awaited)
         lift = next(awaited, None) if grasp is None else self._lifts.get(grasp)

@@ -98,10 +98,10 @@ class Trust:
         return assess(self._judging, self.risk, p_slip, margin, inputs, name=grasp, awaited=awaited)
 
     def review(self, grasp: GraspId, former: Assessment | None) -> Assessment:
-        """Return the `former` assessment of a grasp, updated by the outcomes reported since.
+        """Return the `former` assessment of a grasp, but allowed only if the risk still allows it.
 
-        A grasp that was called `stable` stays allowed. Another one stays allowed only if these
-        outcomes still allow it. `former` None: not assessed yet.
+        A grasp that was called `stable` stays allowed; one that was not allowed stays so. `former`
+        None: it was not assessed yet; return an assessment without probability.
         """
         if former is None:
             return Assessment(self._judging.outcomes)
@@ -113,8 +113,8 @@ class Trust:
     def note(
         self, grasp: GraspId, assessment: Assessment, *, stable: bool, judged: bool = False
     ) -> None:
-        """Enter a grasp's verdict in the book, as `LiftBook.note` does. Raises `ValueError` if
-        `stable` is not allowed."""
+        """Enter a grasp's verdict, as `LiftBook.note` does; an announced lift that leaves the book
+        without an outcome counts as a slip. Raises `ValueError` if `stable` is not allowed."""
         if stable and assessment.permission is not Permission.ALLOWED:
             raise ValueError(f"grasp {grasp.grasp} was called stable: {assessment.permission}")
         if self.lifts.note(grasp, assessment.features, stable=stable, judged=judged):
@@ -130,7 +130,7 @@ class Trust:
         return status
 
     def report(self) -> RiskOutcomes:
-        """Return how many `stable` lifts there were, held and slipped, and what the risk allows."""
+        """Return how many `stable` lifts have an outcome, slipped or wait; and the risk's bound."""
         book = self.lifts
         return self.risk.figures(book.outstanding, book.announced, book.awaited)
 

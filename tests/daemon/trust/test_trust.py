@@ -130,7 +130,7 @@ def test_an_outcome_teaches_the_judgement_that_the_lift_began_on(steps: str, tau
     assert (part.risk.lifts, part.lifts.announced) == ("stable" in steps, steps == "stable 1 offer")
 
 
-def test_judging_again_neither_clears_a_lesson_nor_teaches_after_an_exchange() -> None:
+def test_judging_again_keeps_features_and_restores_none_after_an_exchange() -> None:
     part = trust()
     found = part.judge(named(1), 0.9, 2.2, inputs(0))
     for worth in (found, Assessment(0)):
