@@ -43,7 +43,7 @@ class KeptSession(
     trust: TrustState | None = None
     """State of learning and risk; None without learning."""
     rest: tuple[Annotated[float, msgspec.Meta(ge=0.0, le=COUNT_MAX)], ...] | None = None
-    """Resting count of each electrode, finger by finger; 0: not known."""
+    """Resting count of each electrode, finger by finger; 0: not known. None: of none."""
     saved_at: Annotated[float, msgspec.Meta(ge=0.0, le=1e11)] = 0.0
     """Time of saving, seconds since 1970, for people; 0: not saved."""
 

@@ -172,7 +172,8 @@ class SessionFolder:
 
 
 def look(folder: Path) -> Found:
-    """Return the content of each session file in a folder. Raises `SessionFileError`."""
+    """Return the content of each session file in a folder, or the error in reading it; {} without
+    a folder. Raises `SessionFileError` if the folder itself cannot be read."""
     found: Found = {}
     for number in _numbers(folder):
         try:

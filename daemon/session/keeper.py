@@ -34,7 +34,7 @@ from graspd.drivers.base import Driver
 log = logging.getLogger("graspd")
 
 WAIT_S: Final = 0.4
-"""Longest wait for the disk at the end, s; the daemon has a second to stop."""
+"""Longest wait, s, for each of two saves at the end; the daemon has a second to stop."""
 SAVE_PERIOD_NS: Final = 10_000_000_000
 """Time between two saves, ns, while no outcome waits."""
 WAITING_MAX: Final = 64
@@ -320,7 +320,8 @@ def _continues(
     pipeline: Pipeline, fingers: Sequence[str], kept: KeptSession, problems: list[str]
 ) -> bool:
     """Restore a session; return False if it is of other fingers, does not fit the model, or may be
-    of other sensors. Adds the reason to `problems`, unless the model has no session."""
+    of other sensors. Adds the reason to `problems`, but none if the model needs no statistics and
+    the session has some."""
     try:
         of_fingers(kept, fingers)
         if pipeline.session is None:
@@ -339,7 +340,8 @@ def _restore_trust(
     trust: Trust | None, used: KeptSession, kept: Sequence[KeptSession], problems: list[str]
 ) -> KeptSession | None:
     """Restore this model's last learning with the sensors of `used`; return its session. None: it
-    has none, or it cannot be restored, which is added to `problems`. `trust` None: only return it.
+    has none, or it cannot be restored, which is added to `problems`. `trust` None: restore nothing,
+    and return the session with the last learning of any model.
     """
     why: list[str] = []
     for each, learned in _taught_with(used, kept):
@@ -366,13 +368,14 @@ def _taught_with(
 
 
 def is_of_unknown_sensors(kept: KeptSession) -> bool:
-    """Return True for a session seeded from recorded grasps: it has no rest and no serials, but
-    grasps, which one lacks that ended before the first tare."""
+    """Return True for a session seeded from recorded grasps: it has grasps, but neither rest nor
+    serials. (A session that ended before its first tare has no grasps.)"""
     return kept.grasps > 0 and kept.rest is None and not numbers(kept.serials)
 
 
 def is_of_sensors(one: KeptSession, other: KeptSession) -> bool:
-    """Return True if two sessions have the same fingers and serial numbers, and rest alike."""
+    """Return True if two sessions have the same fingers and serial numbers, and either rest alike
+    or both have no rest."""
     if one.fingers != other.fingers or numbers(one.serials) != numbers(other.serials):
         return False
     shape = len(one.fingers), ELECTRODES

@@ -37,7 +37,8 @@ hand. An untouched sensor changes by 1 in ten seconds.
 FIT_GRASPS: Final = 10
 """Fewest grasps by which unknown sensors are compared with a seeded session."""
 FIT_SPREADS: Final = 1.0
-"""Largest distance of their mean from a seeded session that fits, in its standard deviations.
+"""Largest distance of the grasps' mean from that of a seeded session that fits, in its standard
+deviations.
 
 The distance is the root mean square over the electrodes of a finger, of the finger that is farthest
 off. For ten grasps of a published day it is 0.2 to 0.8 (1 to 99 %) to that day's session, and
@@ -136,7 +137,8 @@ def numbers(serials: Mapping[str, str]) -> dict[str, str]:
 
 
 def moved_fingers(before: Rest, now: Rest) -> list[int]:
-    """Return the rows of fingers whose resting pattern changed more than drift explains."""
+    """Return the rows of fingers whose resting pattern changed more than drift explains. Fingers
+    with fewer than `KNOWN_MIN` electrodes known in both are left out."""
     moved = []
     for finger, (old, new) in enumerate(zip(before, now, strict=True)):
         both_known = (old > 0.0) & (new > 0.0)

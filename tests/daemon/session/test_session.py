@@ -121,7 +121,7 @@ def test_a_grasp_with_a_dead_finger_is_always_unknown(bts3_dir: Path, grasps: in
 
 
 @pytest.mark.parametrize("order", [[0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]])
-def test_verdicts_are_unknown_if_fingers_are_swapped_from_the_start(
+def test_swapped_fingers_give_unknown_from_the_sixth_reading_on(
     bts3_dir: Path, order: list[int]
 ) -> None:
     rows = read_table(bts3_dir / "palm_side.csv").counts
