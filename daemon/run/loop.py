@@ -58,7 +58,7 @@ class Ended(Enum):
     STOPPED = "a signal"
     EXHAUSTED = "the end of the recording"
     SLEPT = "a sleep of the computer"
-    """Readings from before the sleep may look new."""
+    """The loop ends after a sleep, as readings from before it may look new."""
 
 
 POLL = getattr(selectors, "PollSelector", selectors.DefaultSelector)

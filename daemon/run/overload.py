@@ -55,7 +55,7 @@ class LoadShedder:
         self._skipping_since_ns = self._skipped_ns = now_ns - PAUSE_NS
         self.skipped_readings = 0
         self.overloaded = False
-        """True while skipping lasts, and until `RECOVERED_AFTER_NS` after it."""
+        """True once skipping has lasted `REPORT_AFTER_NS`, until `RECOVERED_AFTER_NS` after it."""
 
     def waited(self, now_ns: int) -> None:
         """Note that the loop waited for input until `now_ns`; end an overload that is over."""

@@ -49,7 +49,7 @@ def prepare(path: Path) -> Parts:
 
 
 def enter_realtime(running: scene.Scene, stack: ExitStack) -> RealtimeMode | None:
-    """Enter realtime mode until `stack` closes; None without `[realtime]`."""
+    """Enter realtime mode until `stack` closes, and return it; None without `[realtime]`."""
     if running.realtime is None:
         return None
     from graspd.daemon.run.realtime import RealtimeMode  # only where a scene wants realtime

@@ -162,7 +162,7 @@ class RunSummary:
         self._waiting: dict[GraspId, Decision] = {}
         """Decisions on grasps whose outcome may still come, the oldest first."""
         self.repaired = 0
-        """Number of verdicts with at least one repaired electrode."""
+        """Number of counted verdicts, other than `unknown`, with a repaired electrode."""
         self.latency = LatencyHistogram()
         self.readings = 0
         """Number of verdicts in a run with a gate; 0 without one."""
@@ -253,7 +253,7 @@ def trained_on_line(which: str, known: Iterable[str]) -> str:
 
 
 def _learned(trust: Trust | None) -> Iterator[str]:
-    """Yield lines on what outcomes taught, and on the risk; none before the first outcome."""
+    """Yield lines on what outcomes taught, and on the risk; none if no outcome was reported."""
     if trust is None or not trust.lifts.told:
         return
     yield f"learned from {trust.learner.outcomes} outcomes"

@@ -42,7 +42,7 @@ class Systemd(Companion):
 
     @classmethod
     def of(cls, environment: Mapping[str, str]) -> Systemd | None:
-        """Return the manager named by `environment` (sd_notify(3)); None: no manager."""
+        """Return a sender to the manager that `environment` names (sd_notify(3)); None: no such."""
         address = environment.get("NOTIFY_SOCKET", "")
         if address[:1] not in ("/", "@"):
             return None

@@ -148,7 +148,7 @@ class Unjudged(Companion):
         )
 
     def _damage_in_words(self) -> str | None:
-        """Return text on why most readings cannot be used; None: most can."""
+        """Return text on the reason that makes most readings unusable; None: no single one."""
         for reason, number in self._unreadable.most_common(1):
             if 2 * number > self.readings:
                 return f"{number} of {self.readings} readings {reason}: {ADVICE[reason]}"
@@ -162,7 +162,7 @@ class Unjudged(Companion):
         self._last_ns = made_ns
 
     def _step_in_words(self) -> str | None:
-        """Return text on readings that are too close together or too far apart; None: neither."""
+        """Return text if readings are too close or too far apart; None: neither, or no gate."""
         if not self._steps_s or not self._fingers:
             return None
         step_s = median(self._steps_s)

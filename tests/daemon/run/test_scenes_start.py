@@ -131,7 +131,7 @@ def start(path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, int]]:
-    """A folder with what drawn scenes name, and a free port; a missing folder is an error."""
+    """A folder with what drawn scenes name, and a free port. A missing folder fails `check`."""
     folder = tmp_path_factory.mktemp("s")
     (folder / "folder").mkdir()
     make(folder / "keys", "daemon")
