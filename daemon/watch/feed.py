@@ -56,7 +56,7 @@ class Feed:
     ) -> None:
         """Connect. Raises `zmq.ZMQError` for a wrong endpoint.
 
-        `keys`: from `load_keys`; None: no keys. `clock`: returns ns, also of a sleep.
+        `keys`: from `load_keys`; None: no keys. `clock`: returns ns, which count in a sleep too.
         """
         self.link = Link.CONNECTING
         self._endpoint = endpoint

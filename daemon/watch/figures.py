@@ -23,7 +23,7 @@ SUPERVISED = Line(
 
 
 def doubt(verdict: Verdict) -> Line | None:
-    """Return why outcomes do not support this `stable`, as a word and a line; None: they do."""
+    """Return why this `stable` is doubtful, as a word and a text; None: outcomes support it."""
     risk, p_slip = verdict.risk, verdict.p_slip
     if verdict.early:
         return Line("early", "it may still slide slowly, and is judged once more")
@@ -94,8 +94,8 @@ def counted(count: int, what: str) -> str:
 
 
 def learning(verdict: Verdict | None, status: Status | None) -> list[Line]:
-    """Return lines on learning and session, the most important first, without counts of 0. Empty
-    without a status."""
+    """Return lines on learning and session, the most important first; most counts of 0 have none.
+    Empty without a status."""
     if status is None:
         return []
     lines = []

@@ -14,7 +14,7 @@ class Tone(StrEnum):
 
     STABLE = "stable"
     LEANS = "leans"
-    """`stable`, but not supported by outcomes of lifts yet."""
+    """`stable`, but doubtful, as by too few outcomes, or to be lifted under supervision."""
     SLIP = "slip"
     LEARNING = "learning"
     """`unknown`; a supervised lift is asked for."""
@@ -64,7 +64,7 @@ class FingerMotion(msgspec.Struct, frozen=True, kw_only=True):
     now: float | None
     """Motion now; None: not known."""
     limit: float
-    """Largest motion that counts as still."""
+    """Largest motion that counts as still; 0: not known."""
 
 
 class FingerImage(msgspec.Struct, frozen=True, kw_only=True):
@@ -97,7 +97,7 @@ class JudgedGrasp(msgspec.Struct, frozen=True, kw_only=True):
     grasp: int
     ago_s: float
     lift: str
-    """`held`, `slipped`, `not reported`, or `-`."""
+    """`held`, `slipped` or `not reported`; `-`: no lift was permitted."""
     supervised: bool
     held: bool
 
@@ -119,7 +119,7 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     """Result of `figures.rests_on`; empty while no message comes."""
     p_slip: float | None
     why: list[Line]
-    """Reasons of the verdict; the first line begins with one word to show beside it."""
+    """Reasons of the verdict; a few words, `what` of the first line, are shown beside it."""
     grasp: int | None
     gate: str | None
     contact: list[str] | None
