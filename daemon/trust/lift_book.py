@@ -35,7 +35,7 @@ class Peer(NamedTuple):
 
     routing_id: bytes
     credential: bytes
-    """User or key of the peer, which it cannot choose; its `name` if it has neither."""
+    """User or key of the peer, which it cannot choose; with neither, the routing id's start."""
 
     @property
     def name(self) -> tuple[bytes, bytes]:

@@ -190,7 +190,7 @@ def full() -> Trust:
     return part
 
 
-def test_a_state_with_a_damaged_byte_is_refused() -> None:
+def test_a_damaged_cut_or_too_large_state_is_refused() -> None:
     data = encode(full().state())
     for place in range(0, len(data), 97):
         damaged = bytearray(data)
