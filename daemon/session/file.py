@@ -41,9 +41,9 @@ class KeptSession(
     serials: dict[str, str]
     """Known serial numbers of the sensors, by finger."""
     trust: TrustState | None = None
-    """State of learning and risk; None without learning."""
+    """State of learning and risk; None: of neither."""
     rest: tuple[Annotated[float, msgspec.Meta(ge=0.0, le=COUNT_MAX)], ...] | None = None
-    """Resting count of each electrode, finger by finger; 0: not known. None: of none."""
+    """Resting count of each electrode, finger by finger; 0: not known. None: none is known."""
     saved_at: Annotated[float, msgspec.Meta(ge=0.0, le=1e11)] = 0.0
     """Time of saving, seconds since 1970, for people; 0: not saved."""
 

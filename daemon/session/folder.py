@@ -100,9 +100,9 @@ class SessionFolder:
         return found
 
     def save(self, sessions: Sequence[KeptSession]) -> None:
-        """Save these sessions, first the one that runs, in place of those that were loaded.
+        """Replace the loaded sessions by these: the one that runs, then the last used first.
 
-        The others: the last used first, limited as `KEPT_MAX` says. Raises `SessionFileError`,
+        As many of the others are saved as `KEPT_MAX` allows. Raises `SessionFileError`,
         after which the sessions on the disk are whole.
         """
         if self._lock is None:

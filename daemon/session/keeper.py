@@ -238,7 +238,8 @@ class SessionKeeper(SensorWatch):
         return replace(used, trust=next(learned, None))
 
     def _fits(self, seeded: KeptSession) -> bool:
-        """Return True if `FIT_GRASPS` grasps or more of an uncalibrated session fit `seeded`."""
+        """Return True if the session that runs is not calibrated and fits `seeded`; False with
+        fewer than `FIT_GRASPS` grasps."""
         session, known = self._session, seeded.statistics
         if session is None or session.calibrated or session.grasps < FIT_GRASPS:
             return False
