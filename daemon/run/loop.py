@@ -49,7 +49,7 @@ SILENCE_PERIODS: Final = 10
 DRAINS_MAX: Final = 8
 """Most extra reads of the driver in one round, so that a flood cannot hold the loop."""
 BLOCKED_NS: Final = 50_000
-"""Duration of a wait without its processor time, ns, from which on the loop counts as idle."""
+"""Time for which a wait must block, its processor time left out, for the loop to be idle, ns."""
 
 
 class Ended(Enum):
@@ -252,7 +252,8 @@ class Loop:
     def _after_skipped(
         self, skipped: Sequence[TactileReading], newest: TactileReading
     ) -> TactileReading:
-        """Count the skipped; return `newest`, `HELD` where a finger repeats the last of them."""
+        """Count `skipped`, have the grasp settle again, and return `newest`, with `HELD` where a
+        finger repeats the last skipped reading."""
         self._shedder.skip(len(skipped), self._clock())
         self._interrupt()
         return mark_repeats(newest, skipped[-1])

@@ -41,7 +41,7 @@ class Controller(Companion):
         self._requests = requests
 
     def on_verdict(self, published: PublishedVerdict) -> None:
-        """Keep the grasp of a verdict; report the outcome of the grasp before it."""
+        """Keep a judged grasp whose outcome is recorded; report that of the grasp before it."""
         verdict, reading = published.verdict, published.reading
         if self._lift is not None and self._lift.report.grasp.grasp != verdict.grasp:
             self.tell()

@@ -94,8 +94,8 @@ def counted(count: int, what: str) -> str:
 
 
 def learning(verdict: Verdict | None, status: Status | None) -> list[Line]:
-    """Return lines on learning and session, the most important first; most counts of 0 have none.
-    Empty without a status."""
+    """Return lines on learning and session, the most important first; most counts of 0 have no
+    line. Empty without a status."""
     if status is None:
         return []
     lines = []
