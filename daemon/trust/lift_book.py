@@ -110,8 +110,8 @@ class LiftBookState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class LiftBook:
     """The last `LIFTS_MAX` judged grasps, and who may report how their lifts ended.
 
-    A peer that was answered that it may lift a grasp owns it and reports its outcome. The last
-    such peer also reports for owners with its credential, which may have ended.
+    The first peer that was answered that it may lift a grasp owns it and reports its outcome. The
+    last such peer also reports for owners that have its credential, as these may have ended.
     """
 
     def __init__(self) -> None:

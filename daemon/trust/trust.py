@@ -130,7 +130,7 @@ class Trust:
         return status
 
     def report(self) -> RiskOutcomes:
-        """Return how many `stable` lifts have an outcome, slipped or wait; and the risk's bound."""
+        """Return numbers of `stable` lifts with and without outcome, of slips, and the bound."""
         book = self.lifts
         return self.risk.figures(book.outstanding, book.announced, book.awaited)
 

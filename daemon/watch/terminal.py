@@ -93,7 +93,7 @@ class Keyboard:
         self._waited.register(stop.fileno(), select.POLLIN)
 
     def wait(self) -> bool:
-        """Wait for a tick; return True after a signal that ends, or `q`."""
+        """Wait for a tick; return True after a signal that ends, `q`, or the end of the input."""
         ready = [descriptor for descriptor, _ in self._waited.poll(TICK_S * 1000)]
         if self._stop.fileno() in ready:
             os.read(self._stop.fileno(), SIGNALS_MAX)  # also of other signals
