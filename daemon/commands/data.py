@@ -47,7 +47,10 @@ def run(args: argparse.Namespace) -> int:
     for file in TABLES:
         try:
             said = _get(args, file)
-        except (DataError, OSError) as error:
+        except OSError as error:
+            complain(f"{error.filename or args.to}: {error.strerror}")
+            return 1
+        except DataError as error:
             complain(error)
             return 1
         write_lines(printable(said))
@@ -65,10 +68,7 @@ def _get(args: argparse.Namespace, file: TableFile) -> str:
         if _digest(_read(target)) == file.sha256:
             return f"{target}: is there"
     content = _from_folder(args.folder, file) if args.folder else _fetch(args.url, file)
-    try:
-        write_atomically(target, content, mode=0o644)
-    except OSError as error:  # it names a temporary file
-        raise DataError(f"{target}: {error.strerror}") from error
+    write_atomically(target, content, mode=0o644)
     return f"{target}: {file.rows} grasps"
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 
 from graspd.daemon.assembly.assembly import DEFAULT_MODEL
-from graspd.daemon.commands.arguments import UsageError
+from graspd.daemon.commands.arguments import UsageError, check_folder
 from graspd.daemon.process.text import printable, write_json, write_lines
 from graspd.models import trial, zoo
 from graspd.models.contract import MeasuredError, ModelContract, ModelError
@@ -80,6 +80,8 @@ def run(args: argparse.Namespace) -> int:
         if args.json:
             raise UsageError("--json is for cards: it does not go with wrap")
         args.out = args.out or OUT
+        exists = (folder for folder in (args.out, *args.out.absolute().parents) if folder.exists())
+        check_folder(next(exists))  # now, not after minutes of measuring
         code: int = importlib.import_module(WRAP).run(args)
         return code
     if args.data or args.name is not None or args.out is not None:

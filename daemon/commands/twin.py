@@ -11,6 +11,7 @@ from dataclasses import fields
 from pathlib import Path
 
 from graspd.biotac import ELECTRODES, TABLE_FINGERS
+from graspd.daemon.commands.arguments import check_folder
 from graspd.daemon.process.signals import stopping
 from graspd.daemon.process.text import complain, write_json
 from graspd.drivers.base import DriverError
@@ -209,6 +210,7 @@ def _serve_spi(
 
     channels = SEQUENCES[args.sequence]
     counts = _counts(args, args.rate)
+    check_folder(args.path.parent)
     with SpiTwin(args.path, counts, rate_hz=args.rate, channels=channels, faults=faults) as twin:
         log.info("SPI bridge on %s", args.path)
         twin.serve(lambda: stop.is_set() or twin.exhausted)

@@ -48,20 +48,22 @@ def read_regular(path: Path, max_bytes: int) -> bytes:
 def write_atomically(path: Path, content: bytes, mode: int = 0o600) -> None:
     """Replace the file at `path` in one step; `mode`: its permissions.
 
-    Readers always see a whole file, also after a power cut. After an `OSError` the old file stays.
+    Readers always see a whole file, also after a power cut. After an `OSError`, which names
+    `path`, the old file stays.
     """
     part = path.with_name(f"{path.name}.{os.urandom(4).hex()}")
-    handle = os.open(part, open_flags(os.O_WRONLY | os.O_CREAT | os.O_EXCL), 0o600)
     try:
+        handle = os.open(part, open_flags(os.O_WRONLY | os.O_CREAT | os.O_EXCL), 0o600)
         with open(handle, "wb") as file:
             file.write(content)
             file.flush()
             os.chmod(part, mode)
             os.fsync(handle)
         os.replace(part, path)
-    except OSError:
+    except OSError as error:
         with suppress(OSError):
             part.unlink()
+        error.filename, error.filename2 = str(path), None
         raise
     sync_folder(path.parent)
 

@@ -221,7 +221,8 @@ class McapReader:
         if isinstance(damage, EndOfFile):
             raise RecordingError(self.path, "is empty: nothing was recorded") from damage
         if damage is not None:
-            raise RecordingError(self.path, f"is not an MCAP file: {damage}") from damage
+            problem = "is damaged or cut off: nothing in it can be read"
+            raise RecordingError(self.path, problem) from damage
         problem = f"is an MCAP file, but not one of graspd's; {PAGE} lists what graspd reads"
         raise RecordingError(self.path, problem)
 

@@ -75,7 +75,7 @@ _DAMAGE = (
         apsw.Error,
     ),
     *(ValueError, LookupError, AssertionError, RuntimeError, struct.error),
-    *(OSError, EOFError, MemoryError, OverflowError),
+    *(TypeError, OSError, EOFError, MemoryError, OverflowError),
 )
 """Exceptions of the library for a damaged bag."""
 _log = logging.getLogger(__name__)

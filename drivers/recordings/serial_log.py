@@ -89,16 +89,16 @@ class SerialLog(LinkLogDriver[Record]):
 
     def begin(self) -> None:
         self.stream = Conversation("link log", self._fingers, self._sensors)
-        self.stream.opened(0)
 
     def feed(self, t_ns: int, record: Record) -> Sequence[Reading]:
         event, data = record
-        conversation, readings = self.stream, []
+        conversation = self.stream
+        if event is LineEvent.OPENED or conversation.link.state is LinkState.CLOSED:
+            conversation.link.start(t_ns)
+            conversation.opened(t_ns)
         if event is LineEvent.SENT:
             conversation.sent(data, t_ns)
             return ()
-        if event is LineEvent.OPENED:
-            conversation.opened(t_ns)
-        elif conversation.link.state is not LinkState.WAITING:
-            readings = conversation.receive(data, t_ns)
-        return readings
+        if conversation.link.state is LinkState.WAITING:
+            return ()
+        return conversation.receive(data, t_ns)

@@ -37,9 +37,8 @@ def demo() -> pd.DataFrame:
     return pd.read_csv(DEMO_RECORDING)[:ROWS]
 
 
-def sweeps_of(stream: pd.DataFrame, **joints: str) -> list[Sweep]:
-    """Rows of a stream as messages. `joints`: `prefix` of the joints' names, `rh_` if not given."""
-    prefix = joints.get("prefix", "rh_")
+def sweeps_of(stream: pd.DataFrame, prefix: str = "rh_") -> list[Sweep]:
+    """Rows of a stream as messages. `prefix`: of the joints' names."""
     return [
         Sweep(
             START_NS + round(row["t"] * 1e9),
@@ -127,6 +126,12 @@ def test_a_storage_file_of_packed_messages_names_the_folder(
     (storage,) = (path for path in folder.iterdir() if path.name != "metadata.yaml")
     with pytest.raises(RecordingError, match=r"packed \(zstd\), .* give the bag's folder"):
         fingers_of(storage)
+
+
+def test_a_ros_2_bag_cut_off_at_its_start_is_refused(tmp_path: Path) -> None:
+    folder = BagOf(2).write(tmp_path / "hand", noise(3), storage_plugin=StoragePlugin.MCAP)
+    (folder / "hand.mcap").write_bytes(b"\x89MCAP0\r\n")
+    assert f"{folder}: cannot be read: " in refused("replay", folder)
 
 
 @pytest.mark.parametrize(

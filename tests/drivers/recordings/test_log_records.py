@@ -22,8 +22,9 @@ from graspd.drivers.recordings.serial_log import (
     parse_records,
 )
 from graspd.drivers.spi.conversation import LineEvent
-from graspd.drivers.spi.messages import FrameParser, encode_frame
+from graspd.drivers.spi.messages import FrameParser, Ping, encode, encode_frame
 from tests.drivers.palm.palm_stream import MS
+from tests.drivers.spi.bridge_bench import hello, sweep
 from tests.kit.clock import Clock
 
 
@@ -238,6 +239,22 @@ def test_a_record_whose_time_is_too_late_is_refused(tmp_path: Path) -> None:
     path.write_bytes(encoded([(2**64 - 1, (LineEvent.RECEIVED, b"a"))]))
     with pytest.raises(RecordingError, match=r"line.serial: the time 18446744073.7 s is later"):
         list(SerialLog([path], ("ff", "mf", "th")).records(path))
+
+
+def test_each_opening_of_a_logged_port_is_up_after_its_own_wait(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    log = SerialLog([Path("line.serial")], ("ff", "mf", "th"))
+    caplog.set_level("INFO")
+    for start_ns in (50_000_000 * MS, 50_500_000 * MS):
+        log.feed(start_ns, (LineEvent.OPENED, b""))
+        for nonce in (1, 2):
+            log.feed(start_ns, (LineEvent.SENT, encode(Ping(nonce))))
+            log.feed(start_ns + 250 * MS, (LineEvent.RECEIVED, encode(hello(nonce, 1000))))
+        for seq in (0, 1):
+            end_ns = start_ns + 250 * MS + seq * 10 * MS
+            log.feed(end_ns, (LineEvent.RECEIVED, encode(sweep(seq, 2000 + seq * 10_000))))
+    assert caplog.text.count("up after 0.2") == caplog.text.count("up after") == 2
 
 
 @pytest.mark.parametrize("content", [b"", b"no frames\n" * 1000])

@@ -86,6 +86,12 @@ def wrapped(
     return done.stderr if done.returncode else done.stdout
 
 
+def test_an_unusable_folder_is_refused_before_measuring(folder: Path) -> None:
+    out = folder / "net.py" / "below"
+    done = command("models", "wrap", "no.onnx", "--data", folder / "own.csv", "--out", out)
+    assert (done.returncode, done.stderr) == (2, f"graspd: {folder / 'net.py'}: Not a directory\n")
+
+
 def test_a_piped_table_is_wrapped_and_a_repeated_one_refused(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
