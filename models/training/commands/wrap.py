@@ -68,6 +68,8 @@ def run(args: argparse.Namespace) -> int:
     if not zoo.is_name(name) or name in zoo.names():
         raise ModelError(f"{name!r} cannot be the name of a model: give another --name")
     measured, model = _measured(source, grasps)
+    if measured.f1_mean == 0.0:
+        raise ModelError(f"{source}: calls every grasp of the table that slipped stable")
     contract = ModelContract(
         version=2,
         name=name,

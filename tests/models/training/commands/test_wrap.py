@@ -145,6 +145,7 @@ SIGMOID = "leave the last Sigmoid out"
 MISREAD = {
     "slip before stable": (then(rising(1.0, -1.0), torch.nn.Softmax(1)), "(slip, stable)?"),
     "weak slip before stable": (rising(1.0, -1.0, over=4), "(slip, stable)?"),
+    "stable of all": (rising(0.0, bias=-0.5), "calls every grasp of the table that slipped stable"),
     "log-odds of stable": (rising(-1.0), "log-odds of stable?"),
     "a probability": (then(rising(1.0), torch.nn.Sigmoid()), SIGMOID),
     "a constant probability": (then(rising(0.0), torch.nn.Sigmoid()), SIGMOID),
