@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import functools
 import hashlib
 import http.server
@@ -110,18 +109,6 @@ def test_an_invalid_address_is_refused_in_one_line(tmp_path: Path, address: str)
     assert result.returncode == 1
     (line,) = result.stderr.splitlines()
     assert line.startswith("graspd: http:/")
-
-
-def test_a_full_disk_names_the_file_that_was_asked_for(
-    bts3_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(path: Path, *_: object, **__: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device", f"{path}.ab12")
-
-    monkeypatch.setattr("graspd.daemon.commands.data.write_atomically", full)
-    result = graspd("data", "--to", tmp_path, "--from", bts3_dir)
-    assert result.returncode == 1
-    assert result.stderr == f"graspd: {tmp_path / TABLES[0].name}.csv: No space left on device\n"
 
 
 @pytest.mark.parametrize("kind", ["fifo", "folder"])
