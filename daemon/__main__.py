@@ -13,7 +13,7 @@ INTERRUPTED = 130
 
 
 def main() -> int:
-    """Run the command line; return 130 after a SIGINT that no command handles."""
+    """Run the command line; return its exit code, 130 after a SIGINT that no command handles."""
     heeded = signal.getsignal(signal.SIGINT) is not signal.SIG_IGN
     try:
         if heeded:

@@ -64,7 +64,7 @@ EXTRAS = {
     "evaluate": "train",
     "report": "train,report",
 }
-"""Extra that a command needs to run; its help works without."""
+"""Extra to install, by command, if a module is missing; help, and some uses, work without."""
 LINUX = {"run", "doctor", "keys"}
 """Commands that need Linux, also for their help."""
 LIBRARIES = ("onnxruntime", "numpy", "pyzmq", "python-can", "pyserial")
@@ -121,8 +121,8 @@ def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
 
 
 def _input_errors() -> tuple[type[Exception], ...]:
-    """Return the errors that say which input is wrong. Commands do not catch them. They are
-    imported only here, when a command has failed."""
+    """Return the errors that say which input is wrong, for exit code `WRONG`. They are imported
+    only here, when a command has failed."""
     from graspd.daemon.scene import SceneError
     from graspd.daemon.session.file import SessionFileError
     from graspd.drivers.base import DriverError
@@ -176,7 +176,7 @@ class _Version(argparse.Action):
 
 
 def _commit() -> str:
-    """Return the commit of a checkout, such as ` at 1a2b3c4d`; empty for an installation."""
+    """Return the commit of a checkout, such as ` at 1a2b3c4d`; "" if not a checkout, or no git."""
     import subprocess
 
     folder = Path(__file__).resolve().parents[1]

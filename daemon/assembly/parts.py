@@ -42,7 +42,7 @@ class Parts:
     drivers: list[Driver]
     """All drivers, the tactile one first."""
     boot_id: str | None = None
-    """`boot_id` of the run whose recording is judged again; None: that of this process."""
+    """`boot_id` for the judge: of the recorded run, or `DRAWS` of a table; None: a new one."""
 
     @property
     def scene(self) -> Scene:
@@ -73,7 +73,8 @@ class Assembly:
         self.companions: list[Companion] = []
         """Companions opened so far: sockets, session keeper, recorder."""
         self.keep: Callable[[Answer], None] = at_once
-        """Function that calls its argument, an `Answer`, once the present state is on the disk."""
+        """Function that calls its argument, an `Answer`, once the present state is on the disk; at
+        once if no session is kept."""
         self._outputs: list[Output] = []
         self._parts = parts
         self._stack = stack

@@ -31,14 +31,15 @@ DRAWS = "replay"
 LINK_LOGS = {Kind.SERIAL: "spi", **dict.fromkeys(CAN_LOGS, "can")}
 """Name of the driver for each kind of link log."""
 LINK_SECTIONS = ("hand", "tactile", "model", "gate", "session")
-"""Sections of a scene that change verdicts; a link log has no joints."""
+"""Sections of a scene that count for a link log, which has neither joints nor outcomes."""
 
 
 class Source:
     """Recorded readings to judge again, and the sections of the scene that judges them."""
 
     def __init__(self, sections: Mapping[str, dict[str, Any]], where: Path) -> None:
-        """`sections`: those of the scene by name. `where`: their file, for messages."""
+        """`sections`: those of the scene by name. `where`: their file, for messages; relative paths
+        begin in its folder."""
         self._sections = sections
         self._where = where
 
@@ -46,7 +47,7 @@ class Source:
         """Return the scene with the keys `publish` for `[publish]`. Raises `SceneError`.
 
         `model`: key `name` or `path` of another model; thresholds stay. Empty: the same model.
-        `mode`: mode of the gate; None: as recorded.
+        `mode`: mode of the gate; None: that of the sections, else by the files.
         """
         former = self._sections.get("model", {})
         if model:

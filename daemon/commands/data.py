@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Get every missing file; return 0 if all files are there and their content is right."""
+    """Get every file that is missing or differs; return 0, or 1 at the first that cannot be got."""
     for file in TABLES:
         try:
             said = _get(args, file)

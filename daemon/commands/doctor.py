@@ -53,8 +53,8 @@ COLOURS = {"ok ": Colour.GREEN, "!  ": Colour.YELLOW, "!! ": Colour.RED}
 NARROWEST = 40
 """Fewest columns to which lines are wrapped."""
 WHOLE_DEVICE = frozenset({Cause.SENSOR_ABSENT, Cause.REPEATED, Cause.CLOCK})
-"""Faults of a whole device that make all fingers seem absent; `FRAMES_LOST` as an error too, and
-`MESSAGES` if no finger can be read."""
+"""Faults of a whole device that make all fingers seem absent. `FRAMES_LOST` at level `ERROR` does
+so too, and `MESSAGES` if no finger can be read."""
 NOT_SENT = (
     "Each message must have it: see deploy/wire/TACTILE.md. If it does, check the sensor's plug "
     "and supply."
@@ -236,7 +236,8 @@ def _listen(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> lis
 
 
 def _collect(drivers: Sequence[Driver], statistics: ElectrodeStatistics, listen_s: float) -> float:
-    """Feed readings to `statistics` for `listen_s`; return the time, s, that they cover."""
+    """Feed readings to `statistics` for `listen_s`, or until a recording ends; return the time, s,
+    that they cover, or `listen_s` for fewer than two."""
     start_s = first_s = last_s = time.monotonic()
     while drivers and time.monotonic() - start_s < listen_s and not drivers[0].exhausted:
         poll = select.poll()
@@ -259,7 +260,7 @@ def _with_electrodes(
     told: list[Finding], statistics: ElectrodeStatistics, driver: str
 ) -> list[Finding]:
     """Return `told`, findings on the device, and those on electrodes. If all fingers are absent and
-    `told` explains it, leave those out; what explains it becomes an error."""
+    a finding of `told` explains it, leave out the absent fingers, and make that one an error."""
     electrodes = [
         dataclasses.replace(finding, advice=NOT_SENT)
         if driver == "datagrams" and finding.cause is Cause.SENSOR_ABSENT

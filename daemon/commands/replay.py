@@ -161,7 +161,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Replay; return 0 at the end, 1 if nothing was judged, 128 + its number after a signal."""
+    """Replay; return 0 at the end, 1 if nothing was judged or `--publish` failed, 128 + its number
+    after a signal."""
     if args.wait is not None and args.publish is None:
         raise UsageError("--wait is for subscribers: it needs --publish")
     if args.publish is not None:

@@ -31,7 +31,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run until stopped; 0 after SIGINT, SIGTERM, SIGHUP or the end of a recording, else 1."""
+    """Run until stopped; 0 after SIGINT, SIGTERM, SIGHUP or the end of a recording, else 1.
+
+    Raises `SceneError`, `ModelError` or `RecordingError`.
+    """
     _allow_descriptors()
     try:
         with ExitStack() as stack:

@@ -206,7 +206,7 @@ def _learned(state: TrustState | None) -> dict[str, Any] | None:
 
 
 def _seed(wanted: scene.Scene, model: TactileModel, played: scene_drivers.ReplayTactile) -> None:
-    """Judge `played` recordings, learn from outcomes, keep the session. Raises `DriverError`."""
+    """Replace the kept sessions of the hand's fingers by one of `played`. Raises `DriverError`."""
     mode: GateMode | None = "every" if kind_of_all(played.recordings) is Kind.MCAP else None
     plan = Plan.of(_on_recordings(wanted, played, mode))
     pipeline = assembly.build_pipeline(plan, model)

@@ -158,7 +158,8 @@ def _add_faults(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Serve until stopped or the recording ends; print injected faults as JSON. 2: an error."""
+    """Serve until stopped or the recording ends, print injected faults as JSON and return 0; return
+    2 after an error."""
     stop = threading.Event()
     former = {number: signal.signal(number, lambda *_: stop.set()) for number in stopping()}
     try:

@@ -137,8 +137,8 @@ def _details(ip: Sequence[str]) -> dict[str, dict[str, object]]:
 def file_holders(path: str | Path) -> list[Process]:
     """Return other processes that have locked a file, or if none has, those that have it open.
 
-    Without the right to read /proc the list is empty. The program that made a pseudo-terminal also
-    has it open, and is left out."""
+    Only root finds processes of other users that have not locked it. The program that made a
+    pseudo-terminal also has it open, and is left out."""
     try:
         there = os.stat(path)
     except OSError:
@@ -159,7 +159,7 @@ def file_holders(path: str | Path) -> list[Process]:
 
 
 def port_holders(protocol: str, port: int) -> list[Process]:
-    """Return other processes that listen on a `udp` or `tcp` port; empty if /proc is unreadable."""
+    """Return other processes that listen on a `udp` or `tcp` port; of other users only to root."""
     inodes = set()
     for table in (protocol, f"{protocol}6"):
         with suppress(OSError):

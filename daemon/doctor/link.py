@@ -22,10 +22,11 @@ WHOLES = "frames", "packets", "readings"
 NOT_FRAMES = frozenset(
     {"not_counts", "missed_readings", "cut_sweeps", "interrupted_sweeps", "interrupted_rounds"}
 )
-"""Counters that are not of frames: of values, many in a frame, and of readings in many frames."""
+"""Counters of other things than frames: values, many in a frame, or readings, of many frames."""
 JOINING = frozenset({"unsynchronised_frames", "unsynchronised_packets"})
 JOINING_MAX = 108
-"""Most samples in `JOINING` that are harmless: a listener in mid-sweep loses up to two of 54."""
+"""Most samples in `JOINING` that are harmless: who joins in mid-sweep loses up to two sweeps of 54
+samples."""
 
 FLASH = "Flash the firmware of this graspd: deploy/bridge/BUILD.md."
 AGAIN = "Look longer (--listen 20). If it continues, check"
@@ -51,7 +52,8 @@ STILL_COMES = frozenset({Cause.MESSAGES, Cause.FOREIGN_SENDER, Cause.PALM_MODE})
 """Causes in `NOT_OURS` that also explain why readings stopped. The counters of the others rise with
 a link that breaks."""
 STOPPED_SHARE = 0.1
-"""Share of the readings from which on such a counter, of `BAD_MIN` or more, explains it."""
+"""Least count of a cause in `STILL_COMES`, as a share of the readings, that explains why they
+stopped; it must also be `BAD_MIN`."""
 NOT_OURS_ADVICE = {
     Cause.VERSION: "No known palm sends this length. Other firmware, or a relay that adds bytes.",
     Cause.MESSAGES: "They are of another form than deploy/wire/TACTILE.md or JOINTS.md.",

@@ -88,7 +88,7 @@ class Device(NamedTuple):
     keys: str
     """Keys of the section that name the device, as text."""
     part: str = ""
-    """Part of the device that the driver takes, such as one frame id; empty: all."""
+    """Part of the device that the driver takes: a CAN frame id, `None` if not given; empty: all."""
     only_from: str | None = None
     """IP address of the sender over UDP; None: any may send."""
 

@@ -344,7 +344,10 @@ def load(path: Path) -> Scene:
 
 
 def parse(data: Mapping[str, Any], path: Path) -> Scene:
-    """Check the content of a scene file at `path`. Raises `SceneError`."""
+    """Check the content of a scene file at `path`, to whose folder paths in it are relative.
+
+    Raises `SceneError`.
+    """
     try:
         return Scene.model_validate(data, context={"base": path.parent})
     except ValidationError as error:
