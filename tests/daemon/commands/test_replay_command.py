@@ -122,12 +122,12 @@ def test_a_replayed_table_keeps_the_risk_limit_and_reports_it() -> None:
     assert bare["reasons"].get("unproven") is None
 
 
-def test_a_recording_whose_path_cannot_exist_is_wrong_input() -> None:
+def test_a_too_long_recording_name_is_refused_with_code_2() -> None:
     refused = graspd("replay", "a" * 300)
     assert (refused.returncode, refused.stderr[-21:]) == (2, ": file name too long\n")
 
 
-def test_a_streams_unreadable_outcome_is_refused_if_told(tmp_path: Path) -> None:
+def test_option_outcomes_refuses_a_stream_with_an_unreadable_outcome(tmp_path: Path) -> None:
     header, row, *_ = DEMO_RECORDING.read_text().splitlines()
     place = header.split(",").index("slipped")
     cells = row.split(",")

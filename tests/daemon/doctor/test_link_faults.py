@@ -152,7 +152,7 @@ def test_another_sampling_sequence_on_the_can_board_is_reported(scene: str, boar
         *(("all", 67, 0.0), ("interleaved", 10, 0.8), ("all", 10, 0.8)),
     ],
 )
-def test_a_slow_or_lossy_board_has_the_sequence_it_has(
+def test_only_lost_frames_are_reported_of_slow_or_lossy_boards(
     sequence: str, period_ms: int, loss: float
 ) -> None:
     stream, random = CanStream("bus", FINGERS, sequence=sequence), np.random.default_rng(0)
@@ -179,7 +179,7 @@ def test_a_slow_or_lossy_board_has_the_sequence_it_has(
         *(((0,), loss, Cause.FRAMES_LOST) for loss in (0.6, 0.9)),
     ],
 )
-def test_two_can_boards_of_one_id_are_told_from_loss(
+def test_two_can_boards_with_one_id_are_distinguished_from_frame_loss(
     boards: Sequence[int], loss: float, cause: Cause, sequence: str
 ) -> None:
     """`boards`: when each begins, ns."""
