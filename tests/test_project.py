@@ -38,7 +38,7 @@ def found(name: str, pattern: str) -> list[str]:
 def wheel_of(project: Path, folder: Path) -> dict[str, int]:
     """Build a wheel of `project` in `folder`; return the checksum of each file by its name.
 
-    METADATA and RECORD, which have the version, are left out; names have none.
+    METADATA and RECORD, which contain the version, are left out; it is cut from the names.
     """
     build(project, "wheel", folder)
     (wheel,) = folder.glob("*.whl")

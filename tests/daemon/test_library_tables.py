@@ -20,7 +20,8 @@ from tests.daemon.test_library import GIVEN, columns, messages
 
 
 def held_streams(folder: Path) -> list[Path]:
-    """Write the demo recording up to a `stable` verdict, and what follows, which begins held."""
+    """Write two streams: the demo recording to 20 rows after a `stable` verdict, and the next 100,
+    which begin with the object held; return their paths."""
     head, *rows = DEMO_RECORDING.read_text().splitlines(keepends=True)
     verdicts = [each.verdict.value for each in graspd.judge(DEMO_RECORDING)]
     cut = verdicts.index("stable") + 20

@@ -179,7 +179,7 @@ def test_only_lost_frames_are_reported_of_slow_or_lossy_boards(
         *(((0,), loss, Cause.FRAMES_LOST) for loss in (0.6, 0.9)),
     ],
 )
-def test_two_can_boards_with_one_id_are_distinguished_from_frame_loss(
+def test_two_can_boards_with_one_id_are_distinguished_from_loss(
     boards: Sequence[int], loss: float, cause: Cause, sequence: str
 ) -> None:
     """`boards`: when each begins, ns."""
@@ -208,8 +208,8 @@ def test_two_can_boards_with_one_id_are_distinguished_from_frame_loss(
 
 
 @pytest.mark.parametrize("every_ms", [8, 16])
-def test_an_adapter_that_holds_frames_back_is_named(every_ms: int) -> None:
-    """It has no stamps. Nothing else is wrong: its frames are read at once."""
+def test_an_adapter_holding_frames_back_gets_latency_timer_advice(every_ms: int) -> None:
+    """Its frames have no time stamps; each batch is read as soon as it is handed over."""
     stream = CanStream("bus", FINGERS)
     stream.link.greeting()
     twin = CanTwin("virtual", "bus", iter(Hand(100.0)))
@@ -273,20 +273,20 @@ def told_of(messages: Sequence[object]) -> list[Finding]:
     [("", [*range(2000, 2019)]), ("rh_", [*range(2000, 2024)]), ("", [0.5, *[0.25] * 23])],
     ids=["19 counts", "other names", "fractions"],
 )
-def test_counts_of_another_form_are_messages_and_no_absent_sensor(
+def test_counts_of_another_form_are_reported_as_wrong_messages_alone(
     prefix: str, value: list[float]
 ) -> None:
     (told,) = told_of([{prefix + finger: value for finger in FINGERS}] * 20)
     assert (told.level, told.cause) == (Level.ERROR, Cause.MESSAGES)
 
 
-def test_bad_messages_hide_no_fingers_whose_counts_are_at_the_end() -> None:
+def test_one_bad_message_does_not_hide_that_sensors_are_absent() -> None:
     ended = {finger: [1, *[0] * 23] for finger in FINGERS}
     told = told_of([ended] * 20 + [5])
     assert {finding.cause for finding in told} == {Cause.MESSAGES, Cause.SENSOR_ABSENT}
 
 
-def test_fingers_that_no_message_has_are_not_blamed_on_plugs() -> None:
+def test_fingers_missing_in_most_messages_are_not_blamed_on_plugs() -> None:
     told = told_of([{finger: [*range(2000, 2024)]} for finger in FINGERS] * 10)
     assert {finding.cause for finding in told} == {Cause.SENSOR_ABSENT}
     assert all((each.advice or "").startswith("Each message must have it") for each in told)
