@@ -142,7 +142,8 @@ def examine(
 
 
 def in_words(findings: Sequence[Finding], columns: int | None) -> Iterator[str]:
-    """Yield the findings in lines of at most `columns` (None: one line each), then their counts."""
+    """Yield the findings in lines of at most `columns` (None: one line each), then how many are
+    errors and warnings."""
     for finding in findings:
         what, mark = printable(finding.what), MARKS[finding.level]
         advice = printable(finding.advice or "")
@@ -164,7 +165,8 @@ def in_words(findings: Sequence[Finding], columns: int | None) -> Iterator[str]:
 
 
 def _computer(report: dict[str, Any], listen_s: float) -> list[Finding]:
-    """Return findings on this computer's bridges and CAN interfaces; list all in `report`."""
+    """Return findings on this computer's bridges and CAN interfaces; enter them in `report`, too,
+    with all USB serial ports, but of several bridges only what the last one said."""
     ports = [port for port in computer.serial_ports() if port.vendor is not None]
     interfaces = computer.can_interfaces()
     report["ports"] = [dataclasses.asdict(port) for port in ports]
