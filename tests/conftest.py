@@ -98,7 +98,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.fixture
 def comes_first() -> Iterator[None]:
-    """Give a test that is itself one end of a link in real time priority over other processes."""
+    """Raise the priority of a test that is itself one end of a link which runs in real time."""
     with before_others():
         yield
 

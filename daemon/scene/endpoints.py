@@ -42,7 +42,8 @@ def is_private(endpoint: str) -> bool:
 def clash(first: str, second: str) -> bool:
     """Return True if two checked endpoints cannot both be bound, however they are written.
 
-    An `ipc://` endpoint also takes its path with `.lock`. Both may be a `str` of `udp.Endpoint`.
+    An `ipc://` endpoint also takes its path with `.lock`, and one on all addresses its whole port.
+    Both may be a `str` of `udp.Endpoint`.
     """
     (scheme, _, one), (other_scheme, _, other) = first.partition("://"), second.partition("://")
     if scheme != other_scheme:

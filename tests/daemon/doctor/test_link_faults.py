@@ -254,7 +254,8 @@ def test_bus_off_and_a_can_interface_going_down_are_reported(
 
 
 def told_of(messages: Sequence[object]) -> list[Finding]:
-    """Return the findings on a sender of these `counts`, one message each, that need a look."""
+    """Return the findings, except those that are ok, on a sender whose messages have as `counts`
+    one of `messages` each."""
     statistics = ElectrodeStatistics(FINGERS)
     driver = TactileStreamDriver("udp://127.0.0.1:0", clock=Clock())
     with driver, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
