@@ -23,7 +23,7 @@ class Plan:
 
     scene: Scene
     mode: GateMode
-    """Mode of the gate; without `gate.mode` the recordings decide."""
+    """Mode of the gate; without `gate.mode` that of the recordings, `settled` for live sensors."""
     joints: bool
     """True if joint angles come, from their own source or in a recording."""
     without_outcomes: tuple[Path, ...] = ()

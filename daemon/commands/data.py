@@ -14,7 +14,7 @@ from graspd.daemon.process.text import complain, printable, write_lines
 from graspd.models.bts3 import CITATIONS, LICENCE, TABLES, TableFile
 
 MAX_BYTES = 16 * 2**20
-"""Longest answer that is read. No file of the set has more than 1 MB."""
+"""Most bytes that are read of an answer or a file. No file of the set has more than 1 MB."""
 TIMEOUT_S = 30.0
 """Longest silence of a server, s."""
 MESSAGE_MAX = 320

@@ -104,7 +104,7 @@ def shared_findings(section: DriverSection) -> list[Finding]:
 
 
 def can_finding(interface: computer.CanInterface, tactile: CanTactile | None = None) -> Finding:
-    """Judge a CAN interface; advise how to bring it up at the bit rate that `tactile` gives."""
+    """Judge a CAN interface; advise how to bring it up, at the bit rate of `tactile`."""
     if interface.is_fine:
         return fine(str(interface))
     line = ip_link(interface.name, tactile)
