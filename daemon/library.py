@@ -255,9 +255,9 @@ def _time_of(table: Any) -> str | None:  # noqa: ANN401
 def load(model: str | os.PathLike[str], *, fingers: Sequence[Finger] = ()) -> GraspModel:
     """Return a model by its name (`graspd models` lists them) or by the path of an ONNX file.
 
-    `fingers`: those of the hand, in the order of the counts; a name then gives its variant for
-    exactly these, if there is one. Raises `ModelError`, also if the model needs another finger or
-    order, and `ValueError` for a name that is not a finger's.
+    `fingers`: those of the hand, in order; a name then gives its variant for exactly these, if it
+    has one. The model takes counts of its own `fingers`. Raises `ModelError`, also if these are not
+    among `fingers` in this order, and `ValueError` for a name that is not a finger's.
     """
     check_fingers(fingers)
     found = GraspModel(_path(model, fingers))
