@@ -52,7 +52,7 @@ def test_the_references_show_faults_overload_outcomes_and_exit_codes() -> None:
     assert all(f"\nexit code {code}\n" in texts for code in (0, 1, 2))
 
 
-def test_a_verdict_that_changes_is_found() -> None:
+def test_a_changed_verdict_is_found_by_the_comparison() -> None:
     was = [entry for entry in reference("demo") if entry.get("p_slip") is not None][:2]
     for field, value in (("verdict", "none"), ("p_slip", 0.7), ("n", 3), ("reasons", ["moving"])):
         (line,) = entries_apart(was, [was[0], was[1] | {field: value}])

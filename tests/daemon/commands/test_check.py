@@ -30,7 +30,7 @@ SOCKETCAND = 'interface = "socketcand"\noptions = { host = "127.0.0.1", '
         ('[ask]\nendpoint = "ipc://F/./v"', "ask.endpoint ipc://F/./v must differ"),
     ],
 )
-def test_check_finds_what_run_refuses(section: str, says: str, tmp_path: Path) -> None:
+def test_check_refuses_what_run_would_refuse(section: str, says: str, tmp_path: Path) -> None:
     scene = demo_scene(tmp_path, sections=section.replace("F/", f"{tmp_path}/"))
     (line,) = refused("check", scene).splitlines()
     assert says.replace("F/", f"{tmp_path}/") in line

@@ -54,7 +54,7 @@ def test_data_is_fetched_and_checked(
     assert len(list((tmp_path / "copy").iterdir())) == 3
 
 
-def test_data_that_was_changed_is_refused(mirror: tuple[Path, str], tmp_path: Path) -> None:
+def test_data_changed_on_the_server_is_refused(mirror: tuple[Path, str], tmp_path: Path) -> None:
     folder, address = mirror
     (folder / TABLES[0].upstream_name).write_text("object,slipped\n")
     result = graspd("data", "--to", tmp_path / "data", "--url", address)
