@@ -85,15 +85,9 @@ class DatagramReceiver:
         """Datagrams that the kernel dropped because they were not read in time."""
         self._empty_ns = time.monotonic_ns()
         self._ahead_ns = self._empty_ns - time.time_ns()
-        self._socket = socket.socket(endpoint.family, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
         try:
-            self._socket.setblocking(False)
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-            self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, True)
-            self._socket.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, True)
-            self._socket.bind((endpoint.address, endpoint.port))
+            self._socket = _bound(endpoint)
         except OSError as error:
-            self._socket.close()
             text = f"cannot listen on {endpoint}: {error.strerror}"
             raise LinkError.from_errno(error, text, str(endpoint)) from error
 
@@ -133,6 +127,21 @@ class DatagramReceiver:
             self.dropped = self.dropped if drops is None else drops
             address = plain(sender[0]) if ":" in sender[0] else sender[0]
             yield Datagram(data, age_ns, (address, sender[1]))
+
+
+def _bound(endpoint: Endpoint) -> socket.socket:
+    """Return a socket that listens on `endpoint` and never blocks. Raises `OSError`."""
+    made = socket.socket(endpoint.family, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
+    try:
+        made.setblocking(False)
+        made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+        made.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, True)
+        made.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, True)
+        made.bind((endpoint.address, endpoint.port))
+    except OSError:
+        made.close()
+        raise
+    return made
 
 
 @dataclass(slots=True)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
 import struct
+from unittest.mock import Mock
 
 import pytest
 
@@ -114,6 +116,17 @@ def test_only_from_compares_addresses_and_not_their_spelling(
         near.sendto(b'{"joints":{"FFJ3":0.1}}', (sender, driver.port or 0))
         assert bool(driver.read_ready()) == is_heard
         assert driver.counters.foreign_datagrams == (not is_heard)
+
+
+@pytest.mark.parametrize("number", [errno.EAFNOSUPPORT, errno.EMFILE])
+def test_a_socket_that_cannot_be_made_is_a_link_error(
+    monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    """On a computer without IPv6, or in a process without a free descriptor."""
+    refused = Mock(side_effect=OSError(number, os.strerror(number)))
+    monkeypatch.setattr("graspd.drivers.udp.socket.socket", refused)
+    with pytest.raises(LinkError, match=f"^cannot listen on .*: {os.strerror(number)}$"):
+        JointStreamDriver("udp://[::1]:5700").open()
 
 
 def test_readings_have_their_datagrams_ages_and_never_go_back(bench: Bench) -> None:
