@@ -19,6 +19,7 @@ from graspd.drivers.link import LinkState
 from graspd.drivers.recordings.can_files import read_asc, read_blf, read_csv, read_trc
 from graspd.drivers.recordings.candump import ANY_BUS, NO_BUS, NS_PER_S, Line, parse, read_candump
 from graspd.drivers.recordings.kinds import (
+    CAN_LOGS,
     HEAD_BYTES,
     LINE_LENGTH_MAX,
     PAGE,
@@ -85,14 +86,11 @@ def read_log(path: Path) -> Iterator[Line]:
     """Yield the lines of a CAN log of any kind, those that are not understood too. Raises
     `RecordingError` if the file is of another kind or cannot be read."""
     kind = kind_of(path)
+    if kind not in CAN_LOGS:
+        raise RecordingError(path, f"is {kind.value}, not a CAN log; {PAGE} lists those")
     with open_recording(path) as stream:
-        if kind is Kind.BLF:
-            yield from read_blf(stream)
-            return
-        if kind not in _TEXTS:
-            raise RecordingError(path, f"is {kind.value}, not a CAN log; {PAGE} lists those")
         try:
-            yield from _TEXTS[kind](_lines(stream))
+            yield from read_blf(stream) if kind is Kind.BLF else _TEXTS[kind](_lines(stream))
         except OSError as error:
             raise RecordingError(path, reason(error)) from error
 

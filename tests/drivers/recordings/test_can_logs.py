@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
@@ -114,6 +115,16 @@ def test_a_damaged_blf_file_plays_up_to_the_damage(
     last = log.stream.counters.frames + 1
     said = f"1 of {last} lines were not understood; the first is line {last}, 'damaged"
     assert said in caplog.text
+
+
+def test_a_packed_blf_file_that_is_cut_off_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "bus.blf"
+    with can.BLFWriter(path, compression_level=0) as writer:
+        for message in messages(100):
+            writer(message)
+    path.write_bytes(gzip.compress(path.read_bytes())[:-20])
+    with pytest.raises(RecordingError, match="the packed file is damaged or cut off"):
+        played([path])
 
 
 def test_the_channel_of_a_scene_chooses_the_bus(
