@@ -40,7 +40,7 @@ from graspd.drivers.base import (
     joint_name,
 )
 from graspd.drivers.recordings.kinds import SQLITE, ZSTD, Kind, Unpacked, is_packed, kind_of
-from graspd.drivers.recordings.player import ReadingsDriver
+from graspd.drivers.recordings.player import ReadingsDriver, within_limits
 
 TACTILE: Final = "sr_robot_msgs/msg/BiotacAll"
 SENSOR: Final = "sr_robot_msgs/msg/Biotac"
@@ -210,7 +210,8 @@ class _Bag:
     def messages(self) -> Iterator[tuple[int, Any]]:
         """Yield time, ns, and message of both topics, in the order of the bag.
 
-        The time is the header's, or the bag's if that is 0. Raises `RecordingError` for damage.
+        The time is the header's, or the bag's if that is 0. Raises `RecordingError` for damage, and
+        for a time that is too late.
         """
         read = {(each.topic, each.msgtype) for each in (self.tactile, self.joints) if each}
         everything = self._reader.connections
@@ -228,7 +229,7 @@ class _Bag:
                         "" if name.lower().startswith(self._others) else name
                         for name in message.name
                     ]
-                yield t_ns or bag_ns, message
+                yield within_limits(self._path, t_ns or bag_ns), message
         except _DAMAGE as error:
             raise RecordingError(self._path, f"is damaged: {error}") from error
 

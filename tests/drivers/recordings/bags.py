@@ -27,10 +27,23 @@ class Sweep(NamedTuple):
     """One message of `/rh/tactile`."""
 
     t_ns: int
-    """Stamp of the header, ns; the bag's own time is 0.7 ms later."""
+    """Stamp of the header, ns."""
     electrodes: dict[str, NDArray[np.int16]]
     angles: Mapping[str, float] = MappingProxyType({})
     """Angles of a message of `/joint_states` 1 ms earlier; empty: no such message."""
+    later_ns: int = 700_000
+    """The bag's own time of both messages less their stamps, ns."""
+
+
+def held(sweeps: list[Sweep], *, same_stamp: bool) -> list[Sweep]:
+    """Sweeps of which the fourth and seventh of each seven repeat the one before; `same_stamp`:
+    its stamp too."""
+    found: list[Sweep] = []
+    for number, sweep in enumerate(sweeps):
+        if number % 7 in (3, 6):
+            sweep = found[-1] if same_stamp else found[-1]._replace(t_ns=sweep.t_ns)
+        found.append(sweep)
+    return found
 
 
 class BagOf:
@@ -110,6 +123,6 @@ class BagOf:
             for sweep in sweeps:
                 if sweep.angles:
                     t_ns = sweep.t_ns - 1_000_000
-                    add("/joint_states", t_ns + 700_000, self.joints(t_ns, sweep.angles))
-                add(topic, sweep.t_ns + 700_000, self.tactile(sweep))
+                    add("/joint_states", t_ns + sweep.later_ns, self.joints(t_ns, sweep.angles))
+                add(topic, sweep.t_ns + sweep.later_ns, self.tactile(sweep))
         return path

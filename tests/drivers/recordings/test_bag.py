@@ -22,7 +22,7 @@ from graspd.daemon.publish.messages import Verdict
 from graspd.drivers.base import DriverError, RecordingError, TactileReading
 from graspd.drivers.recordings.bag import SENSOR, TACTILE, BagDriver, fingers_of, has_joints
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING
-from tests.drivers.recordings.bags import ABSENT, WITH_ARRAY, BagOf, Sweep
+from tests.drivers.recordings.bags import ABSENT, WITH_ARRAY, BagOf, Sweep, held
 from tests.kit.inside import refused
 
 START_NS = 1_542_585_600_000_000_000
@@ -214,15 +214,11 @@ def test_a_bag_whose_stamps_stand_still_logs_a_warning(
     assert "no newer stamp" not in caplog.text
 
 
-def held(sweeps: list[Sweep], *, same_stamp: bool) -> list[Sweep]:
-    """Sweeps of which the fourth and seventh of each seven repeat the one before; `same_stamp`:
-    its stamp too."""
-    found: list[Sweep] = []
-    for number, sweep in enumerate(sweeps):
-        if number % 7 in (3, 6):
-            sweep = found[-1] if same_stamp else found[-1]._replace(t_ns=sweep.t_ns)
-        found.append(sweep)
-    return found
+def test_an_unstamped_message_beyond_64_bits_is_refused(tmp_path: Path) -> None:
+    late = noise(1)[0]._replace(t_ns=0, later_ns=1 << 63)
+    path = BagOf(2).write(tmp_path / "hand", [late], storage_plugin=StoragePlugin.MCAP)
+    with pytest.raises(RecordingError, match=r"the time 9223372036\.85 s is later than any"):
+        fingers_of(path)
 
 
 def test_a_bag_whose_values_freeze_gets_only_unknown_verdicts(tmp_path: Path) -> None:
