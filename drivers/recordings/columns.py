@@ -222,6 +222,7 @@ def with_units(names: Sequence[str], cells: Sequence[str]) -> list[str] | None:
     given = {unit.lower() for unit in units} - {""}
     if not given or not given <= UNITS:
         return None
+    units += [""] * (len(names) - len(units))
     return [f"{name} [{unit}]" if unit else name for name, unit in zip(names, units, strict=False)]
 
 

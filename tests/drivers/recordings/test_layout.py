@@ -58,6 +58,9 @@ DIALECTS = {
     "titles": b"Lab A; run 3\n\nDate:,2026-05-04\n" + PLAIN,
     "thirty titles": b"Lab A\n\n" * 30 + PLAIN,
     "units below": PLAIN.replace(b"24\n", b"24\n,-" + b",counts" * 72 + b"\n", 1),
+    "units that end early": table(4, columns=[*ELECTRODES, "object", "slipped"]).replace(
+        b"\n", b"\ncounts" + b",counts" * 71 + b"\n", 1
+    ),
     "fingers above": text(
         lambda it: f",,ff{',' * 24}mf{',' * 24}th\n" + re.sub("(ff|mf|th)_biotac_", "e", it)
     ),
