@@ -109,15 +109,15 @@ class Cells:
     def _header(self, lines: Iterator[str]) -> tuple[str, list[str], Iterator[str]]:
         """Return the separator, the one or two lines of the header, and the lines below. If no
         line at the begin names electrodes, the header is the first line."""
-        separator, comment, above, titles = "", "", "", list[tuple[int, str]]()
-        header, below = list[str](), list[str]()
+        separator, comment, commented, above = "", "", 0, ""
+        titles, header, below = list[tuple[int, str]](), list[str](), list[str]()
         while not header and len(titles) <= TITLE_LINES_MAX and (line := next(lines, "")):
             line, lines = self._with_breaks(line, lines)
             text = line.strip()
             if self.line == 1 and (match := _SEPARATOR_LINE.fullmatch(text)):
                 separator = match[1]
             elif text.startswith("#"):
-                comment = text.lstrip("# ")
+                comment, commented = text.lstrip("# "), self.line
             elif text:
                 tops, names = _split(above, separator), _split(text, separator)
                 if _name_fingers(tops) and has_electrodes(_merged(tops, names)):
@@ -130,7 +130,7 @@ class Cells:
                 above = line
         if not titles:
             raise RecordingError(self._path, "the file is empty")
-        self.header_line = self.line
+        self.header_line = commented if below else self.line
         if not header:
             self.header_line, first = titles[0]
             header = [first]

@@ -74,6 +74,7 @@ BAD_FILES = {
         table(2, columns=[name for name in TABLE_HEADER if name != "mf_biotac_7"]),
         "line 1, column mf_biotac_7: this column is missing; the file has the fingers ff, mf, th",
     ),
+    "in a comment": (b"# " + GOOD.replace(b"ff_biotac_7,", b"x,"), "line 1, column ff_biotac_7: "),
     "a finger missing": (
         table(2, columns=TABLE_HEADER[:-24]),
         "line 1, column th_biotac_1: this column is missing, the first of 24 that are",
