@@ -145,7 +145,7 @@ class Cells:
         while text.count('"') % 2 and len(text) <= LINE_LENGTH_MAX and (more := next(lines, "")):
             held.append((self.line, self.has_end, more))
             text += more
-        if text.count('"') % 2 == 0 and has_electrodes(_split(text, "")):
+        if not held or (text.count('"') % 2 == 0 and _is_header(text)):
             return text, lines
         self.line, self.has_end = start
         return line, chain(self._again(held), lines)
@@ -226,6 +226,13 @@ def _split(text: str, separator: str) -> list[str]:
     """Return the cells of a header; `separator`: empty if it is not known."""
     cells = text.strip().split(separator or _separator(text))
     return [" ".join(cell.strip(' "').split()) for cell in cells]
+
+
+def _is_header(text: str) -> bool:
+    """Return True if `text`, which has line breaks, is one row that names electrodes."""
+    lines = io.StringIO(text, newline="")
+    names, *others = csv.reader(lines, delimiter=_separator(text), skipinitialspace=True)
+    return not others and has_electrodes([" ".join(name.split()) for name in names])
 
 
 def _name_fingers(cells: Sequence[str]) -> bool:

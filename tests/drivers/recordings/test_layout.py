@@ -55,6 +55,8 @@ DIALECTS = {
     "a break in each name": text(lambda it: re.sub(r"(ff|mf|th)_biotac_(\d+)", '"\\1\ne\\2"', it)),
     "an inch in a title": b'Pad of 5" at 2026\n' + PLAIN,
     "an inch and names in quotes": b'5" pad\n' + text(lambda it: re.sub(r"(\w+_\d+)", r'"\1"', it)),
+    "inches in a title and in cells": b'5" pad\n'
+    + text(lambda it: it.replace("\n", ',5"\n').replace('5"', "size", 1)),
     "titles": b"Lab A; run 3\n\nDate:,2026-05-04\n" + PLAIN,
     "thirty titles": b"Lab A\n\n" * 30 + PLAIN,
     "units below": PLAIN.replace(b"24\n", b"24\n,-" + b",counts" * 72 + b"\n", 1),
@@ -73,6 +75,7 @@ DIALECTS = {
     "sep line of another": b"sep=:\r\n" + PLAIN.replace(b",", b":"),
     "a comment within": text(lambda it: it.replace("thing", "# later\nthing")),
     "a header in a comment": b"# lab A\n# " + PLAIN,
+    "many comments": b"# lab A\n" * 40_000 + PLAIN,
     "carriage returns": PLAIN.replace(b"\n", b"\r"),
     "labels in capitals": PLAIN.replace(b"slipped", b"Slipped").replace(b"object", b"OBJECT"),
     "trailing commas in rows": text(lambda it: it.replace("\n", ",\n").replace(",\n", "\n", 1)),
