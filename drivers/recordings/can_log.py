@@ -177,12 +177,15 @@ class CanLog(LinkLogDriver[CanFrame]):
         self._shift_ns = self._last_ns = 0
         self.stream = CanStream("link log", self._fingers, **self._board)
 
-    def open(self) -> None:
-        """Read the first lines of the logs to choose the bus, then start."""
-        self.close()
-        self._surveys = {path: Survey.of(path) for path in self.paths}
+    def close(self) -> None:
+        super().close()
+        self._surveys = {}
+
+    def survey(self) -> None:
+        """Read the first lines of the logs to choose the bus."""
+        surveys = {path: Survey.of(path) for path in self.paths}
         frames: Counter[tuple[str, int | None]] = Counter()
-        for path, survey in self._surveys.items():
+        for path, survey in surveys.items():
             if survey.strange and not survey.frames:
                 why = "the lines have no times" if survey.lacks_times else "no line was understood"
                 problem = f"{why}: {survey.strange}; record with `candump -L`"
@@ -190,7 +193,7 @@ class CanLog(LinkLogDriver[CanFrame]):
             frames += survey.frames
         self._bus = self._choose({bus for bus, _ in frames})
         self._check_ids(frames)
-        super().open()
+        self._surveys = surveys
 
     def _choose(self, buses: set[str]) -> str:
         """Return the bus to play. Raises `RecordingError` if no frame was found, or if there are

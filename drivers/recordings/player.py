@@ -200,11 +200,15 @@ class LinkLogDriver(RecordedDriver[Item]):
         recorded_ns = self.stream.period_ns
         return None if recorded_ns is None else round(recorded_ns / (self.speed or 1.0))
 
+    def survey(self) -> None:
+        """Look at the files before they are played. Raises `RecordingError`."""
+        for path in self.paths:
+            open_recording(path).close()
+
     def open(self) -> None:
         """Start from the first file. Raises `RecordingError`, also if no file has a record."""
         self.close()
-        for path in self.paths:
-            open_recording(path).close()
+        self.survey()
         self.begin()
         logs = [self.records(path) for path in self.paths]
         self.start(self._records(logs))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import logging
+import os
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -125,6 +126,19 @@ def test_a_packed_blf_file_that_is_cut_off_is_refused(tmp_path: Path) -> None:
     path.write_bytes(gzip.compress(path.read_bytes())[:-20])
     with pytest.raises(RecordingError, match="the packed file is damaged or cut off"):
         played([path])
+
+
+def test_logs_closed_before_their_end_leave_no_file_open(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("graspd.drivers.recordings.can_log.FIRST_LINES", 24)
+    paths = [tmp_path / "1.log", tmp_path / "2.log"]
+    for path in paths:
+        path.write_text("".join(lines_of(4)))
+    with CanLog(paths, ("ff", "mf", "th"), arbitration_id=SAMPLE_ID) as log:
+        assert log.read_ready()
+    left = {os.path.realpath(each) for each in Path("/proc/self/fd").iterdir()}
+    assert left.isdisjoint(map(str, paths))
 
 
 def test_the_channel_of_a_scene_chooses_the_bus(
