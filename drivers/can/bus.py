@@ -16,17 +16,21 @@ import socket
 import stat
 from collections.abc import Callable
 from types import MappingProxyType
-from typing import Final
+from typing import Annotated, Final
 
 import can
+import msgspec
 
 from graspd.drivers.base import LinkCause, LinkError
 from graspd.drivers.can.frames import (
     CAN_FRAME,
+    CLASSIC_DATA_MAX,
     ERROR,
     EXTENDED,
+    EXTENDED_ID_MAX,
     LOST,
     REMOTE,
+    STANDARD_ID_MAX,
     CanCounters,
     CanFrame,
     Stamped,
@@ -265,14 +269,31 @@ def _waiting_bytes(bus: can.BusABC) -> int:
     return 0
 
 
+class _Datagram(msgspec.Struct):
+    """Fields of a datagram of `udp_multicast` that are read; names and defaults are python-can's.
+
+    python-can itself takes any type, and makes as many bytes as an integer `data` says.
+    """
+
+    arbitration_id: Annotated[int, msgspec.Meta(ge=0, le=EXTENDED_ID_MAX)]
+    data: Annotated[bytes, msgspec.Meta(max_length=CLASSIC_DATA_MAX)]
+    is_extended_id: bool = True
+    is_remote_frame: bool = False
+    is_error_frame: bool = False
+    is_fd: bool = False
+
+
+_DATAGRAMS: Final = msgspec.msgpack.Decoder(_Datagram)
+
+
 def _unpack_datagram(data: bytes) -> CanFrame | None:
     """Return the frame in a datagram of `udp_multicast`; None if it is malformed."""
-    from can.interfaces.udp_multicast.utils import unpack_message
-
     try:
-        return _frame_of(unpack_message(data, check=True))
-    except (TypeError, ValueError, OverflowError):
+        sent = _DATAGRAMS.decode(data)
+    except (ValueError, RecursionError):
         return None
+    is_sound = sent.is_extended_id or sent.arbitration_id <= STANDARD_ID_MAX
+    return _frame_of(sent) if is_sound else None
 
 
 _UNPACK: Final[dict[str, tuple[Callable[[bytes], CanFrame | None], int]]] = {
@@ -290,7 +311,7 @@ def _enlarge_buffer(descriptor: int) -> None:
         same.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
 
 
-def _frame_of(message: can.Message) -> CanFrame | None:
+def _frame_of(message: can.Message | _Datagram) -> CanFrame | None:
     """Return a message of python-can as a frame; None for one of CAN FD."""
     if message.is_fd:
         return None

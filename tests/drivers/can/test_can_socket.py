@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from can.interfaces.udp_multicast.utils import pack_message
 
 from graspd.drivers.base import ElectrodeFault, TactileReading
 from graspd.drivers.can.driver import CanBridgeDriver
@@ -23,7 +24,9 @@ from tests.drivers.can.can_standin import (
     LOOPBACK,
     ScriptedBus,
     SocketBus,
+    message,
     stand_in,
+    sweep_messages,
     sweep_of_frames,
 )
 from tests.drivers.can.can_words import pack_frame
@@ -118,6 +121,21 @@ def test_records_that_are_not_frames_are_counted(socket_bus: SocketBus) -> None:
         socket_bus.send(*sweep_of_frames(0))
         assert len(driver.read_ready()) == 1
         assert driver.counters.malformed_frames == 4
+
+
+def test_datagrams_of_other_types_than_python_cans_are_malformed(socket_bus: SocketBus) -> None:
+    wrong = [("data", 10**9), ("data", 10**18), ("data", bytes(9)), ("arbitration_id", 256.5)]
+    with CanBridgeDriver("udp_multicast", "239.74.163.2", sequence="electrodes") as driver:
+        for field, value in (*wrong, ("arbitration_id", 0x800), ("is_fd", "no")):
+            sent = message(bytes(7))
+            setattr(sent, field, value)
+            socket_bus.far_end.send(pack_message(sent))
+        socket_bus.far_end.send(b"\x81\xa1x" + 4000 * b"\x91")  # nested 4000 deep
+        for sent in sweep_messages(0):
+            socket_bus.far_end.send(pack_message(sent))
+        (reading,) = tactile(driver.read_ready())
+        assert (reading.counts == counts_of(0)).all()
+        assert (driver.counters.malformed_frames, driver.counters.foreign_frames) == (7, 0)
 
 
 def test_frames_dropped_by_the_kernel_end_the_current_sweep(
