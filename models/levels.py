@@ -6,7 +6,6 @@ Before that, and without a gate, levels show how a finger's electrodes differ fr
 
 from __future__ import annotations
 
-from collections import Counter
 from statistics import median  # the first call of numpy's loads modules
 
 import numpy as np
@@ -31,7 +30,7 @@ SHARE = 0.02
 STRAY_COUNTS = 20.0
 """Limit of a deviation from rest in learning, counts; a larger one, perhaps a touch, is clipped."""
 KNOWN_AFTER = 25
-"""Number of readings after which their mean counts as the resting counts."""
+"""Number of an electrode's readings after which their mean counts as its resting count."""
 
 _FILL = fill_matrix(D1, Fill.NEIGHBOUR_MEAN)[:, :ELECTRODES]
 PIXELS = [row * WIDTH + column for row, column in zip(D1.rows, D1.columns, strict=True)]
@@ -43,21 +42,23 @@ class RestCounts:
 
     def __init__(self) -> None:
         self._means: dict[str, NDArray[np.float64]] = {}
-        self._readings: Counter[str] = Counter()
+        self._readings: dict[str, NDArray[np.int64]] = {}
+        """Number of sound readings of each electrode; shape (24,)."""
 
     def of(self, finger: str) -> NDArray[np.float64] | None:
-        """Return the resting counts of a finger, shape (24,); None: not known yet."""
-        return self._means[finger] if self._readings[finger] >= KNOWN_AFTER else None
+        """Return the resting counts of a finger, shape (24,), NaN where not known yet; None: none
+        is known."""
+        known = self._readings.get(finger, np.zeros(ELECTRODES)) >= KNOWN_AFTER
+        return np.where(known, self._means[finger], np.nan) if known.any() else None
 
     def learn(self, finger: str, counts: NDArray[np.float64], sound: NDArray[np.bool_]) -> None:
         """Learn from counts of a finger without contact, where `sound` is True; shapes (24,)."""
         mean = self._means.setdefault(finger, np.zeros(ELECTRODES))
-        strays = counts - mean
-        if self.of(finger) is not None:
-            strays = np.clip(strays, -STRAY_COUNTS, STRAY_COUNTS)
-        self._readings[finger] += 1
-        share = max(1.0 / self._readings[finger], SHARE)
-        mean += np.where(sound, share * strays, 0.0)
+        readings = self._readings.setdefault(finger, np.zeros(ELECTRODES, np.int64))
+        limit = np.where(readings < KNOWN_AFTER, np.inf, STRAY_COUNTS)
+        readings += sound
+        share = np.maximum(1.0 / np.maximum(readings, 1), SHARE)
+        mean += np.where(sound, share * np.clip(counts - mean, -limit, limit), 0.0)
 
 
 def fall_of(
@@ -65,11 +66,12 @@ def fall_of(
 ) -> NDArray[np.float64]:
     """Return how far each electrode of a finger is below its resting counts; all shapes (24,).
 
-    `rest` None: below the median of the `sound` electrodes. Electrodes that are not sound get the
-    median fall of the sound ones; 0 without any.
+    `rest` None: below the median of the `sound` electrodes. Electrodes that are not sound, or whose
+    rest is NaN, get the median fall of the others; 0 without any.
     """
     reference = median(counts[sound]) if rest is None and sound.any() else rest
     fall = np.zeros(ELECTRODES) if reference is None else reference - counts
+    sound = sound & ~np.isnan(fall)
     if sound.all():
         return fall
     return np.where(sound, fall, median(fall[sound]) if sound.any() else 0.0)

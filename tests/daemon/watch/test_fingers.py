@@ -62,6 +62,16 @@ def test_a_rest_is_learned_only_while_idle_and_tared() -> None:
     assert view.snapshot(0).fingers[1].levels == [100] * 132
 
 
+def test_an_electrode_that_becomes_well_later_is_not_drawn_as_risen() -> None:
+    view = after((b"status.right", status(0, health={})))
+    for seq in range(60):
+        view.take(b"verdict.right", verdict(seq), 0)
+        view.take(b"tactile.right", tactile(seq, RESTING, RESTING, faulty=(6,) * (seq < 30)), 0)
+        assert view.snapshot(0).fingers[0].levels == [0] * 132
+    first, _ = images(view, [3000] * 6 + [1400] + [3000] * 17, RESTING)
+    assert (first.levels[8 * WIDTH + 1], first.marked) == (100, [])  # where E7 stands
+
+
 def test_without_a_rest_an_image_shows_how_electrodes_differ() -> None:
     first, flat = images(a_view(), [3000] * 12 + [2000] * 12, RESTING)
     # The median is 2500, and 500 counts are one standard deviation, of two and a half.
