@@ -14,6 +14,7 @@ from graspd.drivers.base import Opened
 from graspd.drivers.biotac import E1, PAC, PDC, SEQUENCES, TAC, TDC, encode_word
 from graspd.drivers.can.frames import STANDARD_ID_MAX, encode_sample
 from graspd.drivers.can.interfaces import open_bus, refuse_unusable
+from graspd.drivers.twins import NAP_MAX_NS
 from graspd.drivers.twins.faults import LinkFaultInjector, LinkFaults
 from graspd.drivers.twins.grasps.grasps import Counts
 
@@ -100,11 +101,13 @@ class CanTwin(Opened):
             if not frames:
                 return
             for at, frame in enumerate(frames):
-                wait_ns = due_ns + self._period_ns * at // len(frames) - self._clock()
-                if wait_ns > 0:
-                    time.sleep(wait_ns / 1e9)
-                if not self._send(frame) and stop.wait(DOWN_S):
+                frame_ns = due_ns + self._period_ns * at // len(frames)
+                while (wait_ns := frame_ns - self._clock()) > 0 and not stop.is_set():
+                    time.sleep(min(wait_ns, NAP_MAX_NS) / 1e9)
+                if stop.is_set():
                     return
+                if not self._send(frame):
+                    time.sleep(DOWN_S)
             self._discard_received()
             due_ns = max(due_ns + self._period_ns, self._clock() - self._period_ns)
 

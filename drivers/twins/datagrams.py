@@ -26,6 +26,7 @@ from graspd.drivers.palm.packet import (
     PalmPacket,
     TactileSlot,
 )
+from graspd.drivers.twins import NAP_MAX_NS
 from graspd.drivers.twins.faults import LinkFaultInjector, LinkFaults
 from graspd.drivers.twins.grasps.grasps import Counts
 from graspd.drivers.udp import Endpoint
@@ -100,8 +101,10 @@ class DatagramTwin(ABC):
         with socket.socket(endpoint.family, socket.SOCK_DGRAM) as sender:
             due_ns, cycles = time.monotonic_ns(), self.cycles()
             while not stop.is_set():
-                time.sleep(max(due_ns - time.monotonic_ns(), 0) / 1e9)
                 behind_ns = time.monotonic_ns() - due_ns
+                if behind_ns < 0:
+                    time.sleep(min(-behind_ns, NAP_MAX_NS) / 1e9)
+                    continue
                 if behind_ns > BEHIND_MAX_NS:
                     due_ns += behind_ns
                     self._stalled_ns += behind_ns

@@ -34,6 +34,7 @@ from graspd.drivers.spi.messages import (
     decode,
     encode,
 )
+from graspd.drivers.twins import NAP_MAX_NS
 from graspd.drivers.twins.faults import LinkFaultInjector, LinkFaults
 from graspd.drivers.twins.grasps.grasps import Counts
 
@@ -46,8 +47,6 @@ REPLUG_NS = 50_000_000
 UNSENT_MAX_BYTES = 4096
 """Most bytes that wait for the host; after that, whole frames are dropped."""
 READ_BYTES = 4096
-IDLE_NS = 20_000_000
-"""Longest wait of `serve` before it calls `stop` again, ns."""
 SWEEPS_AT_ONCE = 64
 """Most sweeps in a row before the host's bytes are read."""
 UNDRIVEN_WORD = 0xFFFF
@@ -187,8 +186,8 @@ class SpiTwin(Opened):
         """Run until `stop` returns True; it is called at least 50 times a second."""
         while not stop():
             due_ns = self.due_ns()
-            wait_ns = IDLE_NS if due_ns is None else max(due_ns - self._clock(), 0)
-            self.run_once(min(wait_ns, IDLE_NS) / 1e9)
+            wait_ns = NAP_MAX_NS if due_ns is None else max(due_ns - self._clock(), 0)
+            self.run_once(min(wait_ns, NAP_MAX_NS) / 1e9)
 
     def run_once(self, timeout_s: float = 0.0) -> None:
         """Wait up to `timeout_s` for the host, then do what is due."""

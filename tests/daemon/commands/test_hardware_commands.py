@@ -6,6 +6,7 @@ import json
 import signal
 import socket
 import subprocess
+import time
 from pathlib import Path
 
 import numpy as np
@@ -94,6 +95,17 @@ def test_a_recording_sent_by_a_twin_is_published_unchanged(tmp_path: Path, kind:
     rows = {str(row.counts.tolist()) for row in read_rows(DEMO_TABLE, ("ff", "mf", "th"))}
     # A machine that stalls may lose sweeps, so each reading is looked up in all rows.
     assert set(sound) <= rows
+
+
+@pytest.mark.parametrize("kind", ["spi", "can", "datagrams"])
+def test_a_slow_twin_ends_soon_after_a_signal(tmp_path: Path, kind: str) -> None:
+    with twin(kind, tmp_path, "--rate", "0.1") as hardware:
+        assert hardware.stderr is not None
+        hardware.stderr.readline()
+        time.sleep(0.5)
+        before_s = time.monotonic()
+        end(hardware)
+        assert time.monotonic() - before_s < 4.0
 
 
 def test_the_doctor_finds_the_faults_that_a_twin_simulates(tmp_path: Path) -> None:
