@@ -11,7 +11,7 @@ from dataclasses import fields
 from pathlib import Path
 
 from graspd.biotac import ELECTRODES, TABLE_FINGERS
-from graspd.daemon.commands.arguments import check_folder
+from graspd.daemon.commands.arguments import check_folder, within
 from graspd.daemon.process.signals import stopping
 from graspd.daemon.process.text import complain, write_json
 from graspd.drivers.base import DriverError
@@ -78,7 +78,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         kinds.choices[name].add_argument("--to", default=target, help=help_text)
     for kind in (spi, can, datagrams):
         kind.add_argument(
-            "--rate", type=float, default=100.0, metavar="HZ", help="sweeps/s (default: 100)"
+            "--rate",
+            type=within(0.001, 1000.0),
+            default=100.0,
+            metavar="HZ",
+            help="sweeps/s (default: 100)",
         )
     for kind in (spi, can):
         kind.add_argument(

@@ -229,10 +229,7 @@ class TactileTwin(MessageTwin):
         faults: LinkFaults = LinkFaults(),  # noqa: B008 (immutable)
     ) -> None:
         """`fingers`: finger of each row of the counts. `rate_hz`: messages per second. Raises
-        `ValueError` for a rate not above 0 or over 1000, or a fault that messages of counts cannot
-        have."""
-        if not 0.0 < rate_hz <= 1000.0:
-            raise ValueError(f"rate_hz is {rate_hz}, must be above 0 and at most 1000")
+        `ValueError` for a fault that messages of counts cannot have."""
         faults.refuse("the tactile stream", "one_byte_at_a_time", "wrong_version")
         super().__init__(faults)
         self.period_ns = round(1e9 / rate_hz)

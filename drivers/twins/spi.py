@@ -75,10 +75,8 @@ class SpiTwin(Opened):
         tap: Callable[[bytes], None] | None = None,
     ) -> None:
         """`rate_hz`: sweeps/s. `channels`: those of each sweep, in order. `tap`: called with all
-        bytes to the host; None: nothing. Raises `ValueError` for a rate not above 0, a source
-        without counts, or an unknown channel."""
-        if not rate_hz > 0.0:
-            raise ValueError(f"rate_hz is {rate_hz}, must be positive")
+        bytes to the host; None: nothing. Raises `ValueError` for a source without counts, or an
+        unknown channel."""
         counts = iter(source)
         first = next(counts, None)
         if first is None:
