@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -32,6 +33,8 @@ _UNDRIVEN: Final = b"\xff\xff"
 _WORDS: Final = [encode_word(count).to_bytes(2, "big") for count in range(4096)]
 
 Outgoing = tuple[int, bytes]
+
+_log = logging.getLogger(__name__)
 
 
 class CanTwin(Opened):
@@ -67,7 +70,7 @@ class CanTwin(Opened):
         self._interface, self._channel = interface, channel
         self._send_timeout_s = 0.0 if interface == "virtual" else SEND_TIMEOUT_S
         self._bus: can.BusABC | None = None
-        self.unsent = 0
+        self._has_refused = False
 
     def open(self) -> None:
         """Open the bus. Raises `DriverError`, also if a package is missing."""
@@ -139,8 +142,7 @@ class CanTwin(Opened):
         return True
 
     def _put_all(self, frames: Sequence[bytes]) -> None:
-        """Put frames, `ID_BYTES` of id and then data, on the bus; count in `unsent` those that it
-        refuses."""
+        """Put frames, `ID_BYTES` of id and then data, on the bus; log the first that it refuses."""
         if self._bus is None:
             raise RuntimeError("the twin is not open")
         for frame in frames:
@@ -153,8 +155,10 @@ class CanTwin(Opened):
             )
             try:
                 self._bus.send(message, timeout=self._send_timeout_s)
-            except can.CanError:
-                self.unsent += 1
+            except can.CanError as error:
+                if not self._has_refused:
+                    _log.warning("%s refuses frames: %s", self._channel, error)
+                self._has_refused = True
 
     def _discard_received(self) -> None:
         if self._interface == "virtual" and self._bus is not None:

@@ -11,7 +11,9 @@ import tty
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
+import can
 import pytest
 from can.interfaces.udp_multicast.utils import pack_message
 
@@ -206,6 +208,18 @@ def test_counts_pass_through_real_socketcan_unchanged() -> None:
     assert len(readings) == len(counts)
     for reading, expected in zip(readings, counts, strict=True):
         assert (reading.counts == expected).all()
+
+
+def test_a_twin_warns_once_that_its_bus_refuses_frames(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    bus = mock.Mock()
+    bus.send.side_effect, bus.recv.return_value = can.CanOperationError("full"), None
+    stand_in(monkeypatch, lambda: bus)
+    with CanTwin("virtual", "x", iter(sweeps_of(2))) as twin:
+        assert twin.send_sweep()
+        assert twin.send_sweep()
+    assert caplog.messages == ["x refuses frames: full"]
 
 
 def test_a_frame_behind_an_slcan_adapters_answer_is_read(
