@@ -212,7 +212,7 @@ def load_calibration(path: Path) -> JointCalibration:
 
 def parse_calibration(data: Mapping[str, Any], path: Path) -> JointCalibration:
     """Check and convert the content of a file. Raises `CalibrationError`, which names `path`."""
-    problems = list(_problems(data))
+    problems = list(dict.fromkeys(_problems(data)))
     if problems:
         raise CalibrationError(path, problems)
     tables = {joint: Table(points) for joint, points in data.get("joints", {}).items()}
@@ -297,7 +297,7 @@ def _is_number(value: object) -> bool:
 
 
 def _raw_problems(raws: Sequence[float]) -> Iterator[str]:
-    for raw in dict.fromkeys(raws):
+    for raw in raws:
         if raw == 0:
             yield "raw 0 is a placeholder, not a measured value"
         elif not 0 < raw <= COUNT_MAX:
@@ -306,7 +306,7 @@ def _raw_problems(raws: Sequence[float]) -> Iterator[str]:
 
 def _degree_problems(joint: str, degrees: Sequence[float]) -> Iterator[str]:
     low, high = RANGE_DEG[joint]
-    for angle in dict.fromkeys(degrees):
+    for angle in degrees:
         if not low - RANGE_MARGIN_DEG <= angle <= high + RANGE_MARGIN_DEG:
             yield f"{angle} degrees is out of reach, the joint goes from {low} to {high}"
 

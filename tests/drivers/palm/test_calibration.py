@@ -50,6 +50,7 @@ def problems(data: dict[str, object]) -> tuple[str, ...]:
         parse_calibration(data, FILE)
     lines = str(caught.value).splitlines()
     assert all(line.startswith("hand.toml: ") for line in lines)
+    assert len(set(lines)) == len(lines)
     return tuple(line.removeprefix("hand.toml: ") for line in lines)
 
 
