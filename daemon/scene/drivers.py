@@ -161,7 +161,7 @@ class CanTactile(DriverSection):
     data_length: Annotated[int, Field(ge=3, le=8), unit("bytes")] | None = None
     """Length of a frame if the board pads it."""
     bitrate: Annotated[int, Field(ge=10_000, le=1_000_000), unit("bit/s")] | None = None
-    """Rate of the bus; not with socketcan."""
+    """Rate of the bus, unless set elsewhere."""
     options: dict[str, Option] = {}
     """More arguments of the interface, as `{ host = "10.0.0.7", port = 29536 }` of socketcand."""
 

@@ -64,6 +64,14 @@ _BITRATES: Final = {
     "seeedstudio": (5, 10, 20, 50, 100, 125, 200, 250, 400, 500, 800, 1000),
 }
 """Rates that adapters of an interface support, kbit/s. Those of others are not checked."""
+_RATELESS: Final = {
+    "socketcan": "`ip link set CHANNEL type can bitrate` sets it",
+    "socketcand": "its server's computer sets it",
+    "serial": "the adapter has its own; options.baudrate is the rate of the line",
+    "udp_multicast": "datagrams have none",
+    "virtual": "frames stay in the process",
+}
+"""Interfaces that take no bit rate, and why. python-can ignores it there."""
 _OWN_KEYS: Final = frozenset({"interface", "channel", "bitrate"})
 _PORT: Final = Annotated[int, msgspec.Meta(ge=1, le=65535)]
 _TYPES: Final[dict[str, dict[str, Any]]] = {
@@ -163,10 +171,10 @@ def _refuse_channel(interface: str, channel: str) -> None:
 
 
 def _refuse_bitrate(interface: str, bitrate: int | None) -> None:
-    """Raise `ValueError` for a bit rate that is missing, set elsewhere, or not the adapter's."""
+    """Raise `ValueError` for a bit rate that is missing, in vain, or not the adapter's."""
     known = _BITRATES.get(interface)
-    if interface == "socketcan" and bitrate is not None:
-        raise ValueError("bit rates of socketcan are set by `ip link set CHANNEL type can bitrate`")
+    if interface in _RATELESS and bitrate is not None:
+        raise ValueError(f"bitrate: {_named(interface)} takes none: {_RATELESS[interface]}")
     if interface == "canalystii" and bitrate is None:
         raise ValueError(f"bitrate: {_named(interface)} needs one")
     if known and bitrate is not None and bitrate / 1000 not in known:

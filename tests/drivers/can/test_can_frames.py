@@ -298,6 +298,8 @@ def test_frames_that_are_not_ours_are_counted_and_harm_nothing() -> None:
         ("virtual", {"data_length": 9}, "9 bytes"),
         ("virtual", {"options": {"no_such_option": 1}}, "no_such_option"),
         ("socketcan", {"bitrate": 1_000_000}, "ip link set"),
+        ("serial", {"bitrate": 250_000}, "options.baudrate"),
+        ("virtual", {"bitrate": 250_000}, "takes none"),
     ],
 )
 def test_arguments_that_can_never_work_are_refused(

@@ -123,7 +123,8 @@ def test_python_can_gets_bit_rate_and_bounded_queue(
 ) -> None:
     seen: dict[str, object] = {}
     monkeypatch.setattr("graspd.drivers.can.bus.can.Bus", lambda **options: seen.update(options))
-    CanBridgeDriver("virtual", "x", bitrate=500_000).open()
+    CanBridgeDriver("virtual", "x").open()
+    CanBridgeDriver("robotell", "x", bitrate=500_000).open()
     assert seen["rx_queue_size"] == 16384
     assert seen["bitrate"] == 500_000
     assert seen["ignore_config"] is True
