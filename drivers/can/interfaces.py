@@ -160,6 +160,8 @@ def _refuse_channel(interface: str, channel: str) -> None:
             raise ValueError(f"longer than {NAME_BYTES_MAX} bytes, so no network interface has it")
         if interface == "udp_multicast" and not ipaddress.ip_address(channel).is_multicast:
             raise ValueError("not a multicast address, as 239.74.163.2")
+        if interface == "serial" and channel.lower().startswith("rfc2217://"):
+            raise ValueError("each read would wait; a server's raw port is socket://HOST:PORT")
         if interface == "slcan":
             from graspd.drivers.protocol_polled import refuse_url
 

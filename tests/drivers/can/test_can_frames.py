@@ -292,6 +292,7 @@ def test_frames_that_are_not_ours_are_counted_and_harm_nothing() -> None:
 @pytest.mark.parametrize(
     ("interface", "options", "says"),
     [
+        ("serial", {"channel": "rfc2217://here:5"}, "socket://HOST:PORT"),
         ("virtual", {"sensors": ("ff", "mf")}, "not in"),
         ("virtual", {"fingers": ("ff", "mf", "rf", "th")}, "9 bytes cannot carry 4 sensors"),
         ("virtual", {"data_length": 6}, "6 bytes"),
@@ -306,4 +307,4 @@ def test_arguments_that_can_never_work_are_refused(
     interface: str, options: Mapping[str, Any], says: str
 ) -> None:
     with pytest.raises(ValueError, match=says):
-        CanBridgeDriver(interface, "can0", **options)
+        CanBridgeDriver(interface, **{"channel": "can0", **options})
