@@ -219,23 +219,25 @@ class Door:
         """Time from which this status is late, monotonic s."""
         self.is_late = False
         """True if the loop's own subscriber did not receive the last status within `LATE_S`."""
-        self._out = self._socket(zmq.PUSH, porter.MESSAGES, sent=high_water_mark)
-        self._echo = self._socket(zmq.SUB, porter.ECHO)
-        self._echo.subscribe(STATUS)
-        self._ask = self._socket(zmq.DEALER, porter.QUESTIONS, ANSWERS_QUEUED, ASK_QUEUE)
         self._again_s, self._pause_s = 0.0, AGAIN_S
         """Earliest time of the next restart, monotonic s, and the pause before it, s."""
         self._told = b""
         """Output of the process so far: `LOOP_CAME` and `SUBSCRIBER_CAME`."""
         self._process: subprocess.Popen[bytes] | None = None
         try:
+            self._out = self._socket(zmq.PUSH, porter.MESSAGES, sent=high_water_mark)
+            self._echo = self._socket(zmq.SUB, porter.ECHO)
+            self._echo.subscribe(STATUS)
+            self._ask = self._socket(zmq.DEALER, porter.QUESTIONS, ANSWERS_QUEUED, ASK_QUEUE)
             self._process = self._start()
             if not self._is_told(porter.LOOP_CAME, START_S) or not self._out.poll(
                 round(START_S * 1e3), zmq.POLLOUT
             ):
                 raise PublishError(f"{self._plan.endpoints[0]}: libzmq does not serve it")
-        except BaseException:
+        except BaseException as error:
             self.close()
+            if isinstance(error, zmq.ZMQError):  # such as a path that is too long
+                raise PublishError(f"no sockets below TMPDIR: {error.strerror}") from error
             raise
 
     def _socket(self, kind: int, name: str, sent: int = 1, received: int = 1) -> Socket:
@@ -354,13 +356,10 @@ class Door:
         False if the process had to be killed after `CLOSE_S`. May be called again."""
         until_s = time.monotonic() + LINGER_MS / 1e3
         # Messages that the process has not published are lost when it ends.
-        while (
-            not self._echo.closed and self._unheard and (left_s := until_s - time.monotonic()) > 0
-        ):
+        while self._unheard and (left_s := until_s - time.monotonic()) > 0:
             self._hear_echo(left_s)
-        for own in (self._out, self._echo, self._ask):
-            own.close()
-        self._context.term()
+        self._unheard = b""
+        self._context.destroy()
         ended = self._end_process()
         shutil.rmtree(self._folder, ignore_errors=True)
         return ended

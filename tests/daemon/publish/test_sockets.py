@@ -143,6 +143,17 @@ def test_an_unknown_group_is_refused_and_leaves_no_file(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_long_temporary_path_is_refused_and_left_empty(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / ("x" * 90)  # unix(7): a socket's path has at most 107 bytes
+    folder.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(folder))
+    with pytest.raises(PublishError, match="no sockets below TMPDIR: File name too long"):
+        Sockets(scene_of(tmp_path))
+    assert [*tmp_path.rglob("*")] == [folder]
+
+
 def junk(rng: random.Random) -> list[bytes]:
     """Return a message of up to four random frames: a subscription, a question, or neither."""
     kind = rng.randrange(6)
