@@ -26,15 +26,7 @@ from graspd.daemon.process.worker import PROCESSORS
 from graspd.daemon.publish import PublishError, porter
 from graspd.daemon.publish.companion import Companion, PublishedVerdict, Requests
 from graspd.daemon.publish.listener import Listener, user_id
-from graspd.daemon.publish.porter import (
-    ASK_QUEUE,
-    CLOSE_S,
-    LINGER_MS,
-    QUESTIONS_MAX,
-    Frames,
-    Plan,
-    Socket,
-)
+from graspd.daemon.publish.porter import ASK_QUEUE, LINGER_MS, Frames, Plan, Socket
 from graspd.daemon.scene import Scene
 from graspd.daemon.scene.scene import Curve
 
@@ -148,7 +140,8 @@ class Sockets(Companion):
         self._door.check()
         if self.questions is None:
             return None
-        return self.questions.serve(self._door.receive(), self._clock(), requests)
+        due_ns = self.questions.serve(self._door.receive(), self._clock(), requests)
+        return self._clock() if self._door.is_asked else due_ns
 
     def on_verdict(self, published: PublishedVerdict) -> None:
         """Answer all questions if `published.is_answer`, else those due or waiting for the disk."""
@@ -190,7 +183,7 @@ class Door:
     def __init__(
         self,
         listeners: Sequence[Listener],
-        high_water_mark: int = 10,
+        high_water_mark: int = HIGH_WATER_MARK,
         keys: Sequence[str] | None = None,
     ) -> None:
         """Start the process that serves the endpoints. Raises `PublishError` if that fails.
@@ -274,7 +267,7 @@ class Door:
     def fileno(self) -> int:
         """Return a descriptor that becomes readable when a question comes.
 
-        Sending an answer makes it unreadable again, so call `receive` in each round.
+        Sending an answer makes it unreadable again: look at `is_asked` before waiting for it.
         """
         return int(self._ask.getsockopt(zmq.FD))
 
@@ -293,9 +286,14 @@ class Door:
         """Return at most `QUESTIONS_MAX` questions, each with its routing id."""
         received: list[Frames] = []
         with suppress(zmq.Again):
-            while len(received) < QUESTIONS_MAX:
+            while len(received) < porter.QUESTIONS_MAX:
                 received.append(porter.unpacked(self._ask.recv(zmq.NOBLOCK)))
         return received
+
+    @property
+    def is_asked(self) -> bool:
+        """True if a question waits, as after a full `receive`."""
+        return bool(self._ask.poll(0))
 
     def check(self) -> None:
         """Restart the process if it has ended; set `is_late`.
@@ -372,7 +370,7 @@ class Door:
             with suppress(OSError):  # the process has ended
                 _write(process, porter.END)
             try:
-                process.wait(CLOSE_S)
+                process.wait(porter.CLOSE_S)
             except subprocess.TimeoutExpired:
                 process.kill()
                 return False
