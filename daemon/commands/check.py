@@ -109,7 +109,8 @@ def _check(path: Path, *, as_json: bool) -> scene.Scene | None:
         plan = Plan.of(wanted)
         assembly.build_pipeline(plan, model)
         period_ns = _try_drivers(plan)
-        findings = (*key_findings(wanted), *socket_findings(wanted))
+        keys = key_findings(wanted)
+        findings = (*keys, *socket_findings(wanted))
         if wrong := [finding.what for finding in findings if finding.level is Level.ERROR]:
             raise scene.SceneError("\n".join(wrong))
         if wanted.record is not None:
@@ -121,7 +122,11 @@ def _check(path: Path, *, as_json: bool) -> scene.Scene | None:
         "scene": str(path),
         "in": _what_is_in(wanted, model, plan.hand, period_ns),
         "left_out": _what_is_left_out(wanted, model, plan.hand),
-        "warnings": [*_warnings(wanted), *assembly.keep_digest(model)],
+        "warnings": [
+            *_warnings(wanted),
+            *(finding.what for finding in keys),  # none is an error
+            *assembly.keep_digest(model),
+        ],
     }
     for warning in document["warnings"]:
         complain(f"{path}: {warning}")

@@ -161,18 +161,22 @@ def folder_findings(wanted: Scene) -> list[Finding]:
 
 
 def key_findings(wanted: Scene) -> list[Finding]:
-    """Return an error for each wrong key of `[curve]`; empty if all are right or none are used."""
+    """Return an error for each wrong key of `[curve]`, a warning for each that `[ask]` misses."""
     if wanted.curve is None:
         return []
     from graspd.daemon.publish import keys  # only where there are any
 
     try:
         keys.load_own(wanted.curve.secret_key)
-        refused = keys.load_clients(wanted.curve.clients).refused
+        clients = keys.load_clients(wanted.curve.clients)
+        refused, missing = clients.refused, keys.missing(wanted, clients)
     except keys.KeysError as problem:
-        refused = [str(problem)]
+        refused, missing = [str(problem)], []
     advice = f"graspd keys list --dir {wanted.curve.secret_key.parent} shows all keys."
-    return [Finding(Level.ERROR, what, Cause.KEYS, advice) for what in refused]
+    return [
+        *(Finding(Level.ERROR, what, Cause.KEYS, advice) for what in refused),
+        *(Finding(Level.WARNING, what, Cause.KEYS, advice) for what in missing),
+    ]
 
 
 def realtime_findings(wanted: Scene) -> list[Finding]:

@@ -10,9 +10,12 @@ import stat
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from graspd.daemon.process.files import SceneError, read_regular
+
+if TYPE_CHECKING:
+    from graspd.daemon.scene import Scene
 
 log = logging.getLogger("graspd")
 
@@ -110,6 +113,14 @@ def load_clients(folder: Path) -> Clients:
         except KeysError as error:
             clients.refused.append(str(error))
     return clients
+
+
+def missing(wanted: Scene, clients: Clients) -> list[str]:
+    """Return a warning for each key in `ask.tell` that may not connect: it may be added later."""
+    if wanted.ask is None or (wanted.ask_endpoint or "").startswith("ipc://"):
+        return []
+    names = [name for name in wanted.ask.tell or () if name not in clients.admitted.values()]
+    return [f"ask.tell: there is no key {name} that may connect" for name in names]
 
 
 @dataclass(slots=True)

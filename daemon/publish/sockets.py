@@ -78,7 +78,7 @@ class Sockets(Companion):
         tactile_hz = wanted.publish.tactile_hz
         self._tactile_period_ns = round(min(1e9 / tactile_hz, NEVER_NS)) if tactile_hz else None
         self._tactile_due_ns = 0
-        keys = None if wanted.curve is None else _load_keys(wanted.curve)
+        keys = None if wanted.curve is None else _load_keys(wanted, wanted.curve)
         self._door: Door | None = None
         """None after `close`."""
         self.questions: Questions | None = None
@@ -389,9 +389,11 @@ def _sent(to: Socket, frames: Sequence[bytes]) -> bool:
     return False
 
 
-def _load_keys(curve: Curve) -> tuple[str, str, str]:
+def _load_keys(wanted: Scene, curve: Curve) -> tuple[str, str, str]:
     from graspd.daemon.publish import keys  # only where there are any
 
     public, secret = keys.load_own(curve.secret_key)
-    keys.load_clients(curve.clients)  # raises `KeysError` now, while the user is there to mend it
+    clients = keys.load_clients(curve.clients)  # raises now, while the user is there to mend it
+    for warning in keys.missing(wanted, clients):
+        log.warning("%s", warning)
     return public.decode(), secret.decode(), str(curve.clients)

@@ -140,16 +140,20 @@ def test_only_users_named_in_ask_tell_may_lift(
         assert may_lift(sockets, credential) is may
 
 
-def test_only_keys_named_in_ask_tell_may_lift(tmp_path: Path) -> None:
+def test_only_keys_named_in_ask_tell_may_lift(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     make(tmp_path, "daemon")
     public = load_pair(make(tmp_path / "clients", "controller")[1])[0]
     make(tmp_path / "clients", "dashboard")
     endpoint = f"tcp://127.0.0.1:{free_port()}"
-    ask: dict[str, object] = {"endpoint": endpoint, "tell": ["controller"]}
+    ask: dict[str, object] = {"endpoint": endpoint, "tell": ["controller", "contoller"]}
     with Sockets(scene_of(tmp_path, ask=ask, curve=CURVE)) as sockets:
         assert may_lift(sockets, b"key controller")
         for other in (b"", b"key ", b"key dashboard", b"key " + public, b"user 0"):
             assert not may_lift(sockets, other)
+    assert "ask.tell: there is no key contoller that may connect" in caplog.messages
+    assert caplog.text.count("there is no key") == 1
 
 
 @pytest.mark.slow

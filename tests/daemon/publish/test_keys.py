@@ -215,7 +215,9 @@ def test_check_and_run_refuse_keys_that_others_may_replace(tmp_path: Path, comma
     make(tmp_path / "keys", "daemon")
     make(tmp_path / "keys" / "clients", "laptop")
     curve = '[curve]\nsecret_key = "keys/daemon.key_secret"\nclients = "keys/clients"\n'
-    scene = demo_scene(tmp_path, sections=curve)
+    ask = '[ask]\nendpoint = "tcp://127.0.0.1:1"\ntell = ["laptpo"]\n'
+    scene = demo_scene(tmp_path, sections=ask + curve)
+    assert "ask.tell: there is no key laptpo that may connect" in graspd("check", scene).stderr
     (tmp_path / "keys").chmod(0o777)
     assert f"{tmp_path}/keys: mode 0777; others may write it" in refused(command, scene)
 
