@@ -109,14 +109,9 @@ def _summary(export: Export) -> str:
     further = {
         "objects by name": len({grasp.object_name for grasp in grasps} - {None}),
         "grasps without an object": sum(grasp.object_name is None for grasp in grasps),
-        "left out without an outcome": export.without_outcome,
-        "left out with repaired electrodes": export.repaired,
-        "left out with the very counts of one before": export.repeated,
-        "outcomes of grasps that are not in the recordings": export.unjoined,
-        "files that were cut off": export.cut_off,
     }
     counted = [f"{count} {what}" for what, count in further.items() if count]
-    return "; ".join([f"{len(grasps)} grasps, {slipped} slipped", *counted])
+    return "; ".join([f"{len(grasps)} grasps, {slipped} slipped", *counted, *export.lacks()])
 
 
 def _why(export: Export) -> str:

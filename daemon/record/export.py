@@ -127,6 +127,17 @@ class Export:
         self.repeated = len(self.grasps) - len(first)
         self.grasps = {grasp: self.grasps[grasp] for grasp in first.values()}
 
+    def lacks(self) -> list[str]:
+        """Return what the grasps lack, as texts that begin with a number."""
+        lacking = {
+            "left out without an outcome": self.without_outcome,
+            "left out with repaired electrodes": self.repaired,
+            "left out with the very counts of one before": self.repeated,
+            "outcomes of grasps that are not in the recordings": self.unjoined,
+            "files that were cut off": self.cut_off,
+        }
+        return [f"{count} {what}" for what, count in lacking.items() if count]
+
 
 def collect(paths: Sequence[Path]) -> Export:
     """Return the grasps of recordings. `paths`: in the order of time.

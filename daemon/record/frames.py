@@ -32,8 +32,8 @@ def read_grasps(path: str | os.PathLike[str], *, read_as: ReadAs | None = None) 
 
     `path`: a grasp table, or a recording (MCAP); `-` is standard input. Pass `read_as="table"`
     for a table in which many rows repeat each other. A missing or damaged count is NaN. Grasps
-    without an outcome are left out, those of a table with a warning; of a recording also those
-    judged with repaired electrodes or with the counts of an earlier one. Raises `RecordingError`.
+    without an outcome are left out with a warning; of a recording also those after damage, judged
+    with repaired electrodes, or with the counts of an earlier one. Raises `RecordingError`.
     """
     with files_of([Path(path)]) as (file,):
         return _grasps(file, read_as)
@@ -46,7 +46,10 @@ def _grasps(path: Path, read_as: ReadAs | None) -> pd.DataFrame:
         require("mcap", "read_grasps of MCAP", "record")
         from graspd.daemon.record.export import collect
 
-        return grasps_of(collect([path]), "unknown")
+        export = collect([path])
+        if lacks := "; ".join(export.lacks()):
+            warnings.warn(f"{path}: {lacks}", stacklevel=3)
+        return grasps_of(export, "unknown")
     if kind not in TABLES:
         raise RecordingError(path, f"is {kind.value}, which does not say how lifts ended")
     layout = layout_of(path, (), read_as)

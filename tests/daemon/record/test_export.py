@@ -134,6 +134,9 @@ def test_the_export_counts_grasps_and_outcomes_left_out(tmp_path: Path) -> None:
     found = collect([tmp_path / "a.mcap"])
     assert [grasp.slipped for grasp in found.grasps.values()] == [True]  # the later counts
     assert (found.without_outcome, found.repaired, found.unjoined) == (2, 1, 1)
+    lacks = "2 left out without an outcome; 1 left out with repaired electrodes; 1 outcomes of"
+    with pytest.warns(UserWarning, match=lacks):
+        assert len(read_grasps(tmp_path / "a.mcap")) == 1
 
 
 LIFTS = {
