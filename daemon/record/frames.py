@@ -104,6 +104,8 @@ def _readings(path: Path, read_as: ReadAs | None, rate_hz: float | None) -> pd.D
         driver = McapReplayDriver([path], fingers)
     else:
         layout = layout_of(path, (), read_as, rate_hz)
+        if not layout.is_stream:
+            raise RecordingError(path, "is a grasp table and no stream: read_grasps reads it")
         fingers = layout.columns.fingers
         layouts = {path: layout}
         driver = ReplayDriver([path], fingers, layouts=layouts, speed=None, rate_hz=rate_hz)

@@ -20,7 +20,7 @@ from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.plan import Plan
 from graspd.daemon.publish.messages import OutcomeMessage, encode
 from graspd.daemon.record.export import collect
-from graspd.daemon.record.frames import read_grasps
+from graspd.daemon.record.frames import read_grasps, read_recording
 from graspd.daemon.record.mcap import McapWriter
 from graspd.daemon.record.topics import EVENT, Judged, flat
 from graspd.daemon.trust.lift_book import GraspId
@@ -292,9 +292,12 @@ def test_without_any_outcome_nothing_is_written(tmp_path: Path) -> None:
 # Tables of pandas.
 
 
-def test_read_grasps_refuses_a_stream_or_table_without_outcomes(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="is a stream"):
+def test_readers_refuse_files_of_another_kind_or_without_outcomes(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="is a stream and no grasp table: read_recording"):
         read_grasps(DEMO_RECORDING)
+    with pytest.raises(RecordingError, match="is a grasp table and no stream: read_grasps"):
+        read_recording(DEMO_TABLE)
+    assert len(read_recording(DEMO_TABLE, read_as="stream", rate_hz=1.0)) == 200
     table = tmp_path / "grasps.csv"
     pd.read_csv(DEMO_TABLE).drop(columns="slipped").to_csv(table, index=False)
     with pytest.raises(RecordingError, match="no column `slipped`"):
