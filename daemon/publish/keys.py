@@ -109,7 +109,11 @@ def load_clients(folder: Path) -> Clients:
     for path in paths:
         try:
             _refuse_open(path)
-            clients.admitted[load_public(path)] = path.stem
+            key = load_public(path)
+            if key in clients.admitted:
+                same = f"has the same key as {clients.admitted[key]}{PUBLIC}, which is used"
+                raise KeysError(f"{path}: {same}")
+            clients.admitted[key] = path.stem
         except KeysError as error:
             clients.refused.append(str(error))
     return clients

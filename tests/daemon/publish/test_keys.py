@@ -125,6 +125,14 @@ def test_a_broken_key_file_is_named_and_others_are_admitted(tmp_path: Path, kind
     assert ["broken.key: " in why for why in refused] == [True]
 
 
+def test_of_two_files_with_one_key_the_first_is_used(tmp_path: Path) -> None:
+    public, _ = make(tmp_path, "controller")
+    (tmp_path / "spare.key").write_bytes(public.read_bytes())
+    admitted, refused = load_clients(tmp_path)
+    assert list(admitted.values()) == ["controller"]
+    assert refused == [f"{tmp_path}/spare.key: has the same key as controller.key, which is used"]
+
+
 @pytest.mark.parametrize("mode", [0o664, 0o646])
 def test_a_key_that_others_may_write_is_refused(tmp_path: Path, mode: int) -> None:
     public, secret = make(tmp_path, "laptop")
