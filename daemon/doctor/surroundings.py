@@ -269,23 +269,23 @@ def _of_port(name: str, address: str) -> Iterator[Finding]:
     host, _, port = address.rpartition(":")
     host = host.strip("[]")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.socket(family, socket.SOCK_STREAM) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
+    try:
+        with socket.socket(family, socket.SOCK_STREAM) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((host, int(port)))
-        except OSError as problem:
-            what = f"{name}: tcp://{address}: {problem.strerror}"
-            advice = _of_root(int(port))
-            if problem.errno == errno.EACCES and advice is not None:
-                yield Finding(Level.ERROR, what, Cause.SOCKET_DENIED, advice)
-                return
-            if problem.errno != errno.EADDRINUSE:
-                advice = "Name an address of this computer: ip -brief address lists them."
-                yield Finding(Level.ERROR, what, Cause.ADDRESS, advice)
-                return
-            advice = f"sudo ss -tlpn 'sport = {port}' names the program that has it."
-            finding = Finding(Level.WARNING, what, Cause.SOCKET_HELD, advice)
-            yield _held(finding, computer.port_holders("tcp", int(port)))
+    except OSError as problem:
+        what = f"{name}: tcp://{address}: {problem.strerror}"
+        advice = _of_root(int(port))
+        if problem.errno == errno.EACCES and advice is not None:
+            yield Finding(Level.ERROR, what, Cause.SOCKET_DENIED, advice)
+            return
+        if problem.errno != errno.EADDRINUSE:
+            advice = "Name an address of this computer: ip -brief address lists them."
+            yield Finding(Level.ERROR, what, Cause.ADDRESS, advice)
+            return
+        advice = f"sudo ss -tlpn 'sport = {port}' names the program that has it."
+        finding = Finding(Level.WARNING, what, Cause.SOCKET_HELD, advice)
+        yield _held(finding, computer.port_holders("tcp", int(port)))
 
 
 def _of_root(port: int) -> str | None:

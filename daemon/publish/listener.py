@@ -76,9 +76,7 @@ class Listener:
 
     def fileno(self) -> int:
         """Return the descriptor of the listening socket; -1 after `close`."""
-        if self.socket is None:
-            raise PublishError(f"{self.endpoint}: closed")
-        return self.socket.fileno()
+        return -1 if self.socket is None else self.socket.fileno()
 
     def close(self) -> None:
         """Stop listening; remove `PATH.lock` and the socket's file, unless it was replaced. May be
@@ -106,11 +104,11 @@ def user_id(name: str) -> int:
 
 def _listening(endpoint: str) -> socket.socket:
     host, _, port = endpoint.removeprefix("tcp://").rpartition(":")
-    is_6 = "[" in host
-    family = socket.AF_INET6 if is_6 else socket.AF_INET
+    family = socket.AF_INET6 if "[" in host else socket.AF_INET
+    is_dual = family == socket.AF_INET6 and socket.has_dualstack_ipv6()  # else a `ValueError`
     try:
         made = socket.create_server(
-            (host.strip("[]"), int(port)), family=family, backlog=BACKLOG, dualstack_ipv6=is_6
+            (host.strip("[]"), int(port)), family=family, backlog=BACKLOG, dualstack_ipv6=is_dual
         )
     except OSError as error:
         refusal = PublishError(f"cannot bind {endpoint}: {os.strerror(error.errno or 0)}")

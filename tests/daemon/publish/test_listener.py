@@ -113,6 +113,15 @@ def test_an_unusable_path_is_refused_with_one_line(tmp_path: Path, path: str, sa
     assert [each.name for each in tmp_path.iterdir()] == ["file"]
 
 
+def test_ipv6_on_a_kernel_without_it_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_arguments: object) -> None:
+        raise OSError(97, "Address family not supported by protocol")  # socket(2)
+
+    monkeypatch.setattr(socket, "socket", fail)
+    with pytest.raises(PublishError, match="Address family not supported by protocol"):
+        Listener("tcp://[::1]:5555")
+
+
 def test_a_bind_that_fails_leaves_no_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_arguments: object) -> None:
         raise OSError(28, "No space left on device")
