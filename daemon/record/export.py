@@ -17,7 +17,7 @@ from graspd.biotac import ELECTRODES, electrode_columns
 from graspd.daemon.judge.reasons import Decision
 from graspd.daemon.publish.messages import decode_outcome
 from graspd.daemon.record.mcap_reader import McapReader, RecordedMessage
-from graspd.daemon.record.topics import Judged, Said, Topic, decode_judged
+from graspd.daemon.record.topics import MALFORMED, Judged, Said, Topic, decode_judged
 from graspd.daemon.trust.lift_book import GraspId
 from graspd.drivers.base import RecordingError
 from graspd.drivers.recordings.columns import OBJECT, SLIPPED
@@ -82,7 +82,7 @@ class Export:
 
     def take(self, message: RecordedMessage) -> None:
         """Add a verdict, its judged counts, an announced lift or an outcome; ignore other messages.
-        Raises `ValueError` or `OverflowError` for a malformed one."""
+        Raises one of `MALFORMED` for a malformed one."""
         match message.kind:
             case Topic.VERDICT:
                 verdict = _decode_verdict(message.payload)
@@ -159,7 +159,7 @@ def collect(paths: Sequence[Path]) -> Export:
             for message in recording:
                 try:
                     export.take(message)
-                except (ValueError, OverflowError) as error:
+                except MALFORMED as error:
                     raise RecordingError(path, f"{message.kind} message: {error}") from error
             export.cut_off += recording.cut_off
     export.without_outcome = len(export.judged.keys() - export.told)

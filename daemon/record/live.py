@@ -9,7 +9,7 @@ from typing import Final, Self
 import foxglove
 import msgspec
 
-from graspd.daemon.record.topics import flat, schemas
+from graspd.daemon.record.topics import MALFORMED, flat, schemas
 from graspd.daemon.record.viewers import Viewer
 
 ADDRESS: Final = "127.0.0.1"
@@ -50,16 +50,17 @@ class LiveServer:
             return
         try:
             message = msgspec.json.decode(payload)
-        except msgspec.DecodeError:
+            content = msgspec.json.encode(flat(message))
+        except MALFORMED:
             return
         now_ns = time.time_ns()
-        self._log(kind, hand, msgspec.json.encode(flat(message)), now_ns)
+        self._log(kind, hand, content, now_ns)
         if hand not in self._viewers:
             if len(self._viewers) >= CHANNELS_MAX:
                 return
             self._viewers[hand] = Viewer()
-        for made, content in self._viewers[hand].of(kind, message, now_ns):
-            self._log(made, hand, content, now_ns)
+        for made, shown in self._viewers[hand].of(kind, message, now_ns):
+            self._log(made, hand, shown, now_ns)
 
     def _log(self, kind: str, hand: str, payload: bytes, at_ns: int) -> None:
         topic = f"{kind}.{hand}"

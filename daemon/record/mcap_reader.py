@@ -31,7 +31,7 @@ from mcap.stream_reader import CRCValidationError, StreamReader
 
 from graspd.biotac import Finger
 from graspd.daemon.record.mcap import METADATA, RecordingHeader
-from graspd.daemon.record.topics import Topic
+from graspd.daemon.record.topics import MALFORMED, Topic
 from graspd.drivers.base import RecordingError
 from graspd.drivers.recordings.kinds import PAGE, is_packed, open_recording
 
@@ -197,7 +197,7 @@ class McapReader:
     def _header_in(self, record: Metadata) -> RecordingHeader:
         try:
             return RecordingHeader.of(record.metadata)
-        except ValueError as error:
+        except MALFORMED as error:
             raise RecordingError(self.path, "is an MCAP file of another graspd") from error
 
     def _add_loose(self, log_ns: int, begin: int, end: int) -> None:
@@ -337,7 +337,7 @@ class _Implied:
             elif message.kind == Topic.VERDICT and not self.model[0]:
                 judge = msgspec.json.decode(message.payload, type=_Judge)
                 self.model = judge.model, judge.model_sha
-        except ValueError:
+        except MALFORMED:
             return
         self.joints = self.joints or message.kind == Topic.JOINTS
 

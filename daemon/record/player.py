@@ -12,6 +12,7 @@ from graspd.daemon.publish.messages import GateMessage, OutcomeMessage, decode_o
 from graspd.daemon.record.mcap_reader import SEVERAL, McapReader, RecordedMessage, header_of
 from graspd.daemon.record.topics import (
     EVENTS,
+    MALFORMED,
     PLAYED,
     Late,
     Said,
@@ -138,7 +139,7 @@ class McapReplayDriver(ReadingsDriver[_Item]):
                     return decode_gate(message.payload)
                 case Topic.VERDICT:
                     return decode_said(message.payload)
-        except (ValueError, OverflowError):
+        except MALFORMED:
             self.counters.malformed += 1
             return None
         return Topic(message.kind) if message.kind in EVENTS else None

@@ -168,6 +168,8 @@ PLAYED: Final = (
 """Topics that a replay plays in their order; it plays `late`, `gate` and `verdict` before their
 reading, and `dropped` as `skipped`."""
 EVENT: Final = b"{}"
+MALFORMED: Final = ValueError, OverflowError, RecursionError
+"""Exceptions for a malformed message; huge counts and deeply nested JSON cause the last two."""
 
 decode_exchanged = msgspec.json.Decoder(Exchanged).decode
 decode_taken_back = msgspec.json.Decoder(TakenBack).decode

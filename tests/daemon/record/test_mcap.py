@@ -124,6 +124,7 @@ def test_a_header_comes_back_as_it_was_written(state: dict[str, Any], fingers: s
         *[(name, None) for name in REQUIRED],
         *[("fingers", "[]"), ("fingers", '["toe"]'), ("fingers", "5"), ("scene", "[]")],
         *[("session", "{}"), ("trust", "A"), ("grasps", ""), ("file", "first")],
+        pytest.param("scene", "[" * 100_000, id="nested deeply"),
     ],
 )
 def test_a_file_with_an_invalid_header_is_refused(
@@ -216,6 +217,7 @@ def test_malformed_readings_are_counted_and_left_out(tmp_path: Path) -> None:
         b"",
         b"{}",
         b"\xff",
+        b'{"counts":' + b"[" * 100_000,
         json.dumps(READING | {"counts": [1] * 23}).encode(),
         json.dumps(READING | {"counts": [-1] * 24}).encode(),
         json.dumps(READING | {"counts": [70_000] * 24}).encode(),
