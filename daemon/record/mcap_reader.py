@@ -27,7 +27,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, McapError, UnsupportedCompressionError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Message, Metadata
-from mcap.stream_reader import CRCValidationError, StreamReader
+from mcap.stream_reader import MAGIC_SIZE, CRCValidationError, StreamReader
 
 from graspd.biotac import Finger
 from graspd.daemon.record.mcap import METADATA, RecordingHeader
@@ -218,7 +218,7 @@ class McapReader:
         self._spare_bytes = CHUNK_MAX_BYTES
         if implied.fingers:
             return implied.header()
-        if isinstance(damage, EndOfFile):
+        if isinstance(damage, EndOfFile) and self._stream.tell() <= MAGIC_SIZE:
             raise RecordingError(self.path, "is empty: nothing was recorded") from damage
         if damage is not None:
             problem = "is damaged or cut off: nothing in it can be read"

@@ -169,7 +169,10 @@ def test_a_finger_that_was_not_recorded_is_refused(tmp_path: Path) -> None:
         McapReplayDriver([tmp_path / "a.mcap"], ("mf",)).open()
 
 
-@pytest.mark.parametrize(("size", "why"), [(8, "is empty"), (12, "is damaged or cut off")])
+@pytest.mark.parametrize(
+    ("size", "why"),
+    [(8, "is empty"), (12, "is damaged or cut off"), (17, "is damaged or cut off")],
+)
 def test_a_file_without_a_whole_record_is_named_so(size: int, why: str) -> None:
     with pytest.raises(RecordingError, match=why):
         read(WHOLE[:size])
