@@ -246,7 +246,7 @@ class Questions:
             return published.payload
         is_new = question.offer is None
         if is_new and not (self._may_lift(peer, lifts) and lifts.claim(published.grasp, peer)):
-            early = verdict.early and not verdict.supervised
+            early = verdict.early and verdict.valid
             return encode(replace(verdict, supervised=False, early=early, owner="another"))
         lifts.announce()
         if is_new:
@@ -268,6 +268,8 @@ class Questions:
         if tells and len(peer.routing_id) >= NAME_BYTES:
             return True
         if not self.counters["not_theirs"]:
-            log.warning("%r asks `lift` and may not: [ask] tell, deploy/wire/README.md", peer)
+            who = peer.credential.decode(errors="replace")
+            why = f"its routing id has under {NAME_BYTES} bytes" if tells else "[ask] tell"
+            log.warning("%r asks `lift` and may not: %s, deploy/wire/README.md", who, why)
         self.counters["not_theirs"] += 1
         return False

@@ -202,6 +202,17 @@ def test_an_overdue_question_gets_the_last_reasons_until_silence(
     assert (answer["p_slip"], answer["valid"], answer["judged"]) == (None, False, False)
 
 
+@pytest.mark.parametrize(("name", "early"), [("stable", True), ("slip", True), ("unknown", False)])
+def test_a_lift_refused_for_its_routing_id_is_answered_as_judge(
+    asked: Asked, caplog: pytest.LogCaptureFixture, name: str, early: bool
+) -> None:
+    asked.questions.take([[TELLER, USER, b"lift"]], 0, Requests())
+    asked.questions.answer(published(name=name, early=True, supervised=True))
+    answer = json.loads(asked.sent[0][-1])
+    assert (answer["verdict"], answer["supervised"], answer["early"]) == (name, False, early)
+    assert "'user 1000' asks `lift` and may not: its routing id has under 16 bytes" in caplog.text
+
+
 SLIP, STABLE = (f"outcome {BOOT} 7 {how}".encode() for how in ("slip", "stable"))
 
 
