@@ -122,8 +122,7 @@ class SessionKeeper(SensorWatch):
         why = str(result) if isinstance(result, SessionFileError) else UNEXPECTED
         if why != self._warned:
             unexpected = None if isinstance(result, SessionFileError) else result
-            warning = "%s; the next start begins without what is new"
-            log.warning(warning, why, exc_info=unexpected)
+            log.warning("%s; the next start begins without what is new", why, exc_info=unexpected)
         self._warned = why
         self._answer(self._in_writing, Reply(Told.NOT_KEPT, why))
 
@@ -259,7 +258,7 @@ class SessionKeeper(SensorWatch):
         """
         leaving = self._now()
         if not leaving.is_empty:
-            self._others = tuple(newest_of_each([leaving, *self._others])[: KEPT_MAX - 1])
+            self._others = tuple(newest_of_each([leaving, *self._others])[:KEPT_MAX])
         self._unused = self._rest = None
         if former is None or not self._take_up(former, tared=tared):
             self._sensors_exchanged()
@@ -278,6 +277,7 @@ class SessionKeeper(SensorWatch):
         except ValueError as error:
             log.warning("what was kept of these sensors %s; a new session begins", error)
             return False
+        self._others = tuple(newest_of_each([former, *self._others])[1:])
         self._unused = trust
         self._serials, self._rest = numbers(former.serials), self._rest_of(former.rest)
         if self._session is not None or trust is not None:

@@ -113,14 +113,15 @@ class Model:
 
     def leave(self) -> None:
         if not self.running.is_empty:
-            self.others = self.newest_of_each([self.running, *self.others])[:4]
+            self.others = self.newest_of_each([self.running, *self.others])[:5]
 
     def see(self, sensor: str) -> None:
         """Expect another session if the sensor is another one: its own if it was there before."""
         if self.running.sensor in ("", sensor):
             self.running.sensor = sensor
             return
-        running, _ = self.with_sensor(sensor)
+        running, learned = self.with_sensor(sensor)
+        self.others = [each for each in self.others if each is not learned]
         self.leave()
         self.running = running
 
