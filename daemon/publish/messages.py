@@ -174,7 +174,7 @@ class Tactile(_Message, frozen=True, kw_only=True):
     """Faults of each electrode, 0 if it is well. Bits: 1 missing, 2 not a count, 4 parity, 8 error
     word, 16 held, 32 cut off."""
     joints: dict[str, float] = {}
-    """Newest angle of each joint that has one, rad."""
+    """Newest angle of each joint that has one, rad; none older than 0.15 s."""
 
 
 class OutcomeMessage(_Message, frozen=True, kw_only=True):

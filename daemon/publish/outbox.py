@@ -7,13 +7,14 @@ import sys
 import time
 import uuid
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import onnxruntime
 
 from graspd.biotac import Finger
 from graspd.daemon import version
+from graspd.daemon.judge.joint_motion import LATE_NS
 from graspd.daemon.judge.pipeline import Judgement, Pipeline
 from graspd.daemon.judge.reasons import Decision, GateChange, Moment, Reason
 from graspd.daemon.publish.messages import (
@@ -30,7 +31,7 @@ from graspd.daemon.publish.messages import (
     encode,
 )
 from graspd.daemon.trust.lift_book import Report
-from graspd.drivers.base import JointReading, TactileReading
+from graspd.drivers.base import TactileReading
 
 if TYPE_CHECKING:
     from graspd.daemon.trust.trust import Trust
@@ -234,8 +235,11 @@ class Outbox:
         )
         self._send("outcome", encode(message))
 
-    def tactile(self, reading: TactileReading, joints: JointReading | None) -> None:
-        """Send a reading with the newest joint angles to the outputs whose `wanted` is True now."""
+    def tactile(self, reading: TactileReading, joints: Mapping[str, tuple[int, float]]) -> None:
+        """Send a reading to the outputs whose `wanted` is True now.
+
+        `joints`: time, ns, and value, rad, of the newest angle of each joint; none is sent late.
+        """
         topic = self._topics["tactile"]
         wanting = [output for output in self._outputs if output.wanted(topic)]
         if not wanting:
@@ -246,7 +250,11 @@ class Outbox:
             fingers=list(self._fingers),
             counts=reading.counts.tolist(),
             faults=reading.faults.tolist(),
-            joints={} if joints is None else _angles(joints),
+            joints={
+                name: angle_rad
+                for name, (made_ns, angle_rad) in joints.items()
+                if abs(reading.made_ns - made_ns) <= LATE_NS
+            },
         )
         payload = encode(message)
         for output in wanting:
@@ -346,8 +354,3 @@ def _learner(trust: Trust) -> LearnerHealth:
         told=dict(trust.lifts.told),
         uncertainty=trust.learner.uncertainty,
     )
-
-
-def _angles(joints: JointReading) -> dict[str, float]:
-    pairs = zip(joints.names, joints.position_rad.tolist(), strict=True)
-    return {name: angle for name, angle in pairs if math.isfinite(angle)}

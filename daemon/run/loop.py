@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import selectors
 import time
 from collections.abc import Callable, Sequence
@@ -122,7 +123,8 @@ class Loop:
         self._on_status = hooks(companions, Companion.on_status)
         self._after_round = hooks(companions, Companion.after_round)
 
-        self._joints: JointReading | None = None
+        self._joints: dict[str, tuple[int, float]] = {}
+        """Time, ns, and value, rad, of the newest angle of each joint."""
         self._watched: list[int] = []
         """Descriptors of drivers and companions in the selector."""
         self._state = State.RUNNING
@@ -214,7 +216,7 @@ class Loop:
                 self._interrupt()
             if isinstance(reading, JointReading):
                 self._pipeline.observe_joints(reading)
-                self._joints = reading
+                self._joints |= _angles(reading)
                 continue
             backlog -= 1
             if backlog and (skipped or self._should_skip(backlog + 1, began_ns - received_ns)):
@@ -383,6 +385,11 @@ class Loop:
         if reply.told is Told.KEPT:
             self._pipeline.lifts.keep(grasp)
         answer(reply)
+
+
+def _angles(joints: JointReading) -> dict[str, tuple[int, float]]:
+    pairs = zip(joints.names, joints.position_rad.tolist(), strict=True)
+    return {name: (joints.made_ns, angle) for name, angle in pairs if math.isfinite(angle)}
 
 
 def _count_tactile(readings: Sequence[Reading]) -> int:

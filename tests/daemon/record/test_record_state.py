@@ -156,7 +156,7 @@ class Daemon:
         """
         ages = iter(ages_ms)
         self._now_ns = reading.t_ns
-        self._outbox.tactile(reading, None)
+        self._outbox.tactile(reading, {})
         self.pipeline.clock = lambda: reading.t_ns + next(ages) * 1_000_000
         judgement = self.pipeline.judge(reading)
         if Reason.STALE in judgement.reasons:  # a lift that waited is taken back first

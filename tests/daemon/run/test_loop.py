@@ -152,9 +152,11 @@ class Watchdog(Companion):
 
 def test_a_reading_is_sent_only_while_there_is_a_subscriber() -> None:
     clock = Clock()
-    angles = JointReading(clock(), 0, ("FFJ3", "MFJ3"), np.array([0.5, np.nan]))
+    late = JointReading(clock() - 151 * MS, 0, ("THJ4", "FFJ4"), np.array([0.1, 0.2]))
+    angles = JointReading(clock(), 1, ("FFJ3", "MFJ3"), np.array([0.5, np.nan]))
+    others = JointReading(clock(), 2, ("FFJ4",), np.array([0.3]))
     first, second, third = (reading(clock(), seed) for seed in (1, 2, 3))
-    came: list[Reading | DriverError] = [first, angles, second, third]
+    came: list[Reading | DriverError] = [first, late, angles, others, second, third]
     bench = LoopBench(FakeDriver(came, clock), clock)
     send = bench.output.send
 
@@ -170,7 +172,7 @@ def test_a_reading_is_sent_only_while_there_is_a_subscriber() -> None:
     assert message.counts == second.counts.tolist()
     assert message.faults == second.faults.tolist()
     assert message.fingers == list(FINGERS)
-    assert message.joints == {"FFJ3": 0.5}
+    assert message.joints == {"FFJ3": 0.5, "FFJ4": 0.3}
 
 
 class Peer(Companion):
