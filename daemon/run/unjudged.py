@@ -81,7 +81,7 @@ class Unjudged(Companion):
             self._touched.update(moment.touching)
             self._fingers = tuple(moment.fingers or ())
         self._unreadable.update(UNREADABLE.intersection(judgement.reasons))
-        self._was_tared |= Reason.NOT_TARED not in judgement.reasons
+        self._was_tared |= {Reason.NOT_TARED, *UNREADABLE}.isdisjoint(judgement.reasons)
         if moment.grasp != self._grasp:
             self._end_grasp()
             self._grasp = moment.grasp

@@ -32,6 +32,13 @@ def held_without_one_electrode(stream: pd.DataFrame) -> pd.DataFrame:
     return stream[REST_ROWS:].assign(**{name: np.nan})
 
 
+def held_from_a_saturated_reading_on(stream: pd.DataFrame) -> pd.DataFrame:
+    """Return `stream` from the first touch on, with counts of 4095 in the first reading."""
+    held = stream[REST_ROWS:].copy()
+    held.iloc[0, [place for place, name in enumerate(held) if "biotac" in name]] = 4095
+    return held
+
+
 def without_thumb(stream: pd.DataFrame) -> pd.DataFrame:
     """Return `stream` with the thumb at rest, as in the first row, with noise of three counts."""
     thumb = [name for name in stream.columns if name.startswith("th_")]
@@ -46,6 +53,7 @@ def without_thumb(stream: pd.DataFrame) -> pd.DataFrame:
         (times(1e-6), "readings are 0 us apart: is the time in seconds, with fractions?"),
         (every(10), "readings are 100 ms apart (10 Hz): a grasp settles from 20 Hz on, or"),
         (lambda stream: stream[REST_ROWS:], "no 100 readings of an open hand come first (1 s at"),
+        (held_from_a_saturated_reading_on, "no 100 readings of an open hand come first (1 s at"),
         (held_without_one_electrode, "(1 s at this rate), or electrodes were not read (200 r"),
         (every(4), "no 100 readings of an open hand come first (4 s at"),
         (lambda stream: stream[: REST_ROWS + 5], "no finger touched: the hand was open"),
