@@ -284,12 +284,12 @@ def judge(
     judged. Raises `SceneError`, `RecordingError`, `ModelError` or `ValueError`.
     """
     said: list[str] = []
-    why = Unjudged(said.append)
     with ExitStack() as stack:
         paths = stack.enter_context(files_of(_files(recordings, stack)))
         chosen = {} if model is None else {"path": _path(model).absolute()}
         parts = _parts(paths, chosen, read_as, rate_hz)
         pipeline, driver = parts.pipeline, parts.drivers[0]
+        why = Unjudged(said.append, parts.scene.gate.fingers)
         around = Assembly(parts, stack)
         outbox = around.build_outbox()
         around.open_drivers()

@@ -200,7 +200,7 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
         if isinstance(source, Tables):
             (shown.result.trained_on,) = trained_on(parts.plan.layouts, [model])
         told = [shown]
-    why = Unjudged(complain)
+    why = Unjudged(complain, parts.scene.gate.fingers)
     controller = Controller(only_lifted=args.only_lifted)
     if args.outcomes:
         told.append(controller)

@@ -213,7 +213,7 @@ def _seed(wanted: scene.Scene, model: TactileModel, played: scene_drivers.Replay
     session, trust = pipeline.session, pipeline.trust
     with SessionFolder(wanted.session_path) as folder:
         before = list(_readable(folder.load()).values())
-        unjudged = Unjudged(complain)
+        unjudged = Unjudged(complain, wanted.gate.fingers)
         judgements = _judge(plan, pipeline, unjudged)
         unjudged.end()
         readings = len(judgements)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from statistics import median
 from typing import Final
 
@@ -36,9 +36,12 @@ class Unjudged(Companion):
     Times and angles in a wrong unit are reported as soon as they are seen.
     """
 
-    def __init__(self, say: Callable[[str], None]) -> None:
-        """`say`: writes a line."""
+    def __init__(
+        self, say: Callable[[str], None], required: Sequence[Finger] | None = None
+    ) -> None:
+        """`say`: writes a line. `required`: fingers that must touch; None: all."""
         self._say = say
+        self._required = required
         self._last_ns: int | None = None
         self._steps_s: list[float] = []
         self._angle: tuple[str, float] | None = None
@@ -133,7 +136,8 @@ class Unjudged(Companion):
         elif self._fingers and not self._touched:
             yield "no finger touched: the hand was open all the time"
         else:
-            if missing := [finger for finger in self._fingers if finger not in self._touched]:
+            required = self._required or self._fingers
+            if missing := [finger for finger in required if finger not in self._touched]:
                 yield f"{', '.join(missing)} never touched: all required fingers hold a grasp"
             for reason, number in self.not_judged.most_common(CAUSES_MAX):
                 yield f"{number} {reason}: {ADVICE[reason]}"

@@ -72,6 +72,18 @@ def test_a_stream_without_a_judgement_says_why(tmp_path: Path, change: Change, c
     assert cause in str(warned[0].message)
 
 
+def test_a_finger_that_need_not_touch_is_not_a_cause(tmp_path: Path) -> None:
+    scene, stream = tmp_path / "right.toml", tmp_path / "stream.csv"
+    scene.write_text(
+        '[tactile]\ndriver = "spi"\nport = "/nowhere"\n[gate]\nfingers = ["ff", "mf"]\n'
+        f'[session]\nkeep = true\nfolder = "{tmp_path}/kept"\n'
+    )
+    without_thumb(pd.read_csv(DEMO_RECORDING)[: REST_ROWS + 105]).to_csv(stream, index=False)
+    done = graspd("session", "seed", scene, stream)
+    assert "nothing was judged:" in done.stderr
+    assert "never touched" not in done.stderr
+
+
 def test_a_table_of_broken_sensors_says_why(tmp_path: Path) -> None:
     table = pd.read_csv(DEMO_TABLE)
     electrodes = [name for name in table.columns if "biotac" in name]
