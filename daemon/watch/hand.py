@@ -14,7 +14,7 @@ from graspd.daemon.watch.snapshot import FingerImage, FingerMotion, JudgedGrasp
 from graspd.models.levels import PIXELS, RestCounts, fall_of, levels_of
 
 OLD_NS = 1_000_000_000
-"""Largest age of a reading whose image is shown, ns."""
+"""Largest age of a reading whose image and joint angles are shown, ns."""
 GRASPS_MAX = 8
 
 Key = tuple[str, int]
@@ -49,8 +49,8 @@ class Fingers:
     def images(self, verdict: Verdict, status: Status | None, now_ns: int) -> list[FingerImage]:
         """Return the image of each finger in the newest reading; none if it is too old."""
         broken = set() if status is None else status.health.keys()
-        tactile = self._tactile
-        if tactile is None or now_ns - self._tactile_ns > OLD_NS:
+        tactile = self._recent(now_ns)
+        if tactile is None:
             return []
         indices = range(len(tactile.fingers))
         return [self._image(tactile, index, verdict, broken) for index in indices]
@@ -77,9 +77,13 @@ class Fingers:
             state=_state(verdict, name),
         )
 
-    @property
-    def joints(self) -> dict[str, float]:
-        return {} if self._tactile is None else self._tactile.joints
+    def joints(self, now_ns: int) -> dict[str, float]:
+        """Return the angles of the newest reading, rad; none if it is too old."""
+        tactile = self._recent(now_ns)
+        return {} if tactile is None else tactile.joints
+
+    def _recent(self, now_ns: int) -> Tactile | None:
+        return self._tactile if now_ns - self._tactile_ns <= OLD_NS else None
 
 
 def _broken(places: Sequence[int], repaired: Sequence[bool]) -> str:

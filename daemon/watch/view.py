@@ -232,7 +232,7 @@ class View:
             still=stillness(None if verdict is None else verdict.still_ms),
             grasps=self._grasps.last(now_ns, None if silent else self._held()),
             fingers=[] if verdict is None else self._fingers.images(verdict, status, now_ns),
-            joints={} if silent else self._fingers.joints,
+            joints={} if silent else self._fingers.joints(now_ns),
             health=health,
             not_well=_not_well(health, why),
             state=None if status is None or silent else _state(status),

@@ -110,10 +110,11 @@ def test_a_reading_of_fewer_electrodes_has_no_image(counts: list[int]) -> None:
     assert images(a_view(), counts, RESTING) == []
 
 
-def test_images_go_when_readings_no_longer_come() -> None:
+def test_images_and_angles_go_when_readings_no_longer_come() -> None:
     view = after((b"tactile.right", tactile(0, RESTING, RESTING)))
     view.take(b"verdict.right", verdict(0), 1001 * MS)
-    assert view.snapshot(1001 * MS).fingers == []
+    seen = view.snapshot(1001 * MS)
+    assert (seen.fingers, seen.joints) == ([], {})
 
 
 def told_of(**told: Any) -> list[FingerImage]:  # noqa: ANN401
