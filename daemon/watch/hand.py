@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
 
@@ -27,7 +28,7 @@ class Fingers:
     def __init__(self) -> None:
         self._tactile: Tactile | None = None
         self._tactile_ns = 0
-        self._rest = RestCounts()
+        self._rest: defaultdict[str, RestCounts] = defaultdict(RestCounts)
 
     def take(self, tactile: Tactile, now_ns: int, resting: Collection[str]) -> bool:
         """Take in a reading; return False, and ignore it, if its shapes are wrong.
@@ -43,8 +44,13 @@ class Fingers:
             if finger in resting:
                 counts = np.array(tactile.counts[index])
                 sound = np.array(tactile.faults[index]) == 0
-                self._rest.learn(finger, counts, sound)
+                self._rest[finger].learn(finger, counts, sound)
         return True
+
+    def forget(self, fingers: Iterable[str]) -> None:
+        """Forget the resting counts of these fingers, whose sensors may be others now."""
+        for finger in fingers:
+            self._rest.pop(finger, None)
 
     def images(self, verdict: Verdict, status: Status | None, now_ns: int) -> list[FingerImage]:
         """Return the image of each finger in the newest reading; none if it is too old."""
@@ -64,7 +70,7 @@ class Fingers:
         repaired = [electrode in verdict.repaired for electrode in electrodes]
         faulty = np.array(tactile.faults[index]) != 0
         sound = ~(faulty | repaired | [electrode in broken for electrode in electrodes])
-        rest = self._rest.of(name)
+        rest = self._rest[name].of(name)
         fall = fall_of(counts, sound, rest)
         return FingerImage(
             name=name,

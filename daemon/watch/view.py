@@ -189,6 +189,8 @@ class View:
         now_ns = self._arrival_ns(verdict, earliest_ns, latest_ns)
         self._verdict, self._verdict_ns, self._gate = verdict, now_ns, verdict.gate
         self._grasps.take(verdict, now_ns)
+        if Reason.NOT_TARED in verdict.reasons and verdict.fingers is not None:
+            self._fingers.forget(name for name, state in verdict.fingers.items() if state is None)
 
     def _arrival_ns(self, verdict: Verdict, earliest_ns: int, latest_ns: int) -> int:
         """Return when a verdict arrived, ns, estimated by its own time, as it may have waited."""

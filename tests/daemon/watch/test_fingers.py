@@ -72,6 +72,16 @@ def test_an_electrode_that_becomes_well_later_is_not_drawn_as_risen() -> None:
     assert (first.levels[8 * WIDTH + 1], first.marked) == (100, [])  # where E7 stands
 
 
+def test_the_rest_of_a_finger_without_a_tare_is_forgotten() -> None:
+    """Its sensor, which may be another one, then rests 400 counts lower."""
+    view, untared = rested(), [Reason.NOT_TARED, Reason.NO_CONTACT]
+    view.take(b"verdict.right", verdict(50, reasons=untared, fingers={"ff": None, "th": "free"}), 0)
+    for seq in range(50, 75):
+        view.take(b"tactile.right", tactile(seq, [2600] * 24, RESTING), 0)
+    first, second = images(view, [2600] * 24, [2600] * 24)
+    assert (first.from_rest, first.deepest, second.deepest) == (True, 0, 400)
+
+
 def test_without_a_rest_an_image_shows_how_electrodes_differ() -> None:
     first, flat = images(a_view(), [3000] * 12 + [2000] * 12, RESTING)
     # The median is 2500, and 500 counts are one standard deviation, of two and a half.
