@@ -105,7 +105,7 @@ class Keyboard:
                 if b"\t" in typed:
                     self.tabs, self.spaces = self.tabs + typed.count(b"\t"), 0
                 self.spaces += typed.count(b" ")
-                return typed[:1] in {b"q", b"Q", b""}
+                return not typed or b"q" in typed.lower()
         return False
 
     @contextlib.contextmanager
