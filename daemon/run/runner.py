@@ -129,9 +129,10 @@ class Runner:
         around.keep_session()
         realtime = enter_realtime(running, stack)
         around.record()
+        controller = _controller(running)
         companions = [
             *(self._manager, self._log, *around.companions),
-            *(realtime, _controller(running)),
+            *(realtime, controller),
         ]
         self._loop = Loop(
             parts.drivers,
@@ -143,6 +144,8 @@ class Runner:
             around.keep,
         )
         stack.callback(self._loop.close)
+        if controller is not None:
+            stack.callback(controller.tell)
         log.info("verdict.%s on %s", running.hand.name, running.endpoint)
         if running.ask_endpoint is not None:
             log.info("questions on %s", running.ask_endpoint)

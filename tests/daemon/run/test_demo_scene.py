@@ -14,6 +14,7 @@ from graspd.daemon.publish.companion import PublishedVerdict
 from graspd.daemon.publish.messages import Verdict
 from graspd.daemon.run import runner
 from graspd.daemon.run.runner import RunLog
+from graspd.daemon.trust.lift_book import Report
 from graspd.daemon.watch.figures import doubt
 from graspd.drivers.recordings.csv_player import SHOW_RECORDING
 from graspd.drivers.twins.grasps.whole_grasps import PALM_RATE_HZ
@@ -24,14 +25,19 @@ LOOPS = 2
 
 
 class Heard(RunLog):
-    """Keeps the verdicts in place of counting them."""
+    """Keeps verdicts and outcomes in place of counting verdicts."""
 
     def __init__(self) -> None:
         super().__init__()
         self.verdicts: list[Verdict] = []
+        self.told: dict[int, bool] = {}
+        """For each grasp whose outcome was told, whether it slipped."""
 
     def on_verdict(self, published: PublishedVerdict) -> None:
         self.verdicts.append(published.verdict)
+
+    def on_outcome(self, report: Report) -> None:
+        self.told[report.grasp.grasp] = report.outcome == "slip"
 
 
 def test_the_demos_stable_is_supported_by_outcomes_within_two_minutes(
@@ -65,7 +71,8 @@ def test_the_demos_stable_is_supported_by_outcomes_within_two_minutes(
     for row, verdict in zip(rows * LOOPS, verdicts, strict=True):
         if verdict.verdict is Decision.STABLE or verdict.supervised:
             slipped[verdict.grasp] = row["slipped"] == "1"
-    slipped.pop(verdicts[-1].grasp, None)  # its outcome would be told at the next grasp
+    assert heard.told == slipped
+    slipped.pop(verdicts[-1].grasp, None)  # its outcome is told after the last verdict
     lifted = {verdict.grasp for verdict in stable} & slipped.keys()
     last = verdicts[-1]
     assert last.risk is not None
