@@ -79,16 +79,16 @@ def _sent(object_name: str | None) -> str | None:
 
 def trained_on(
     layouts: Mapping[Path, Layout], models: Sequence[TactileModel]
-) -> list[dict[str, str]]:
+) -> list[dict[Path, str]]:
     """Return for each model the recordings with grasps on which it was trained.
 
-    Each result maps file names of recordings to a text with the number of grasps that the model
-    knows. Grasps and tables are recognised by their content, not by name. `layouts`: layout of each
+    Each result maps paths of recordings to a text with the number of grasps that the model knows.
+    Grasps and tables are recognised by their content, not by name. `layouts`: layout of each
     recording, by path. The `models` must judge the same fingers. Raises `RecordingError` and
     `ModelError`.
     """
     known = [known_grasps.of_model(model) for model in models]
-    found: list[dict[str, str]] = [{} for _ in models]
+    found: list[dict[Path, str]] = [{} for _ in models]
     fingers = models[0].contract.fingers
     for path, layout in layouts.items():
         if layout.is_stream:
@@ -103,5 +103,5 @@ def trained_on(
             if digest in {dataset.sha256 for dataset in model.contract.datasets}:
                 trained = len(counts)  # an older model has no hashes of its grasps
             if trained:
-                of_model[path.name] = f"{trained} of {len(counts)} grasps of {path.name}"
+                of_model[path] = f"{trained} of {len(counts)} grasps of {path.name}"
     return found

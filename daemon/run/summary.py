@@ -7,6 +7,7 @@ import sys
 import time
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
 from typing import Any, Final
 
 from graspd.daemon.judge.reasons import Decision, GateState, Reason
@@ -157,8 +158,8 @@ class RunSummary:
 
     def __init__(self) -> None:
         self.tally = Tally()
-        self.trained_on: Mapping[str, str] = {}
-        """Names of recordings that the model was trained on, each with a text for people."""
+        self.trained_on: Mapping[Path, str] = {}
+        """Recordings that the model was trained on, each with a text for people."""
         self._waiting: dict[GraspId, Decision] = {}
         """Decisions on grasps whose outcome may still come, the oldest first."""
         self.repaired = 0
@@ -211,7 +212,7 @@ class RunSummary:
             "repaired": self.repaired,
             "outcomes": 0 if trust is None else trust.learner.outcomes,
             "risk": None if trust is None else trust.report()._asdict(),
-            "trained_on": list(self.trained_on),
+            "trained_on": [path.name for path in self.trained_on],
             "latency_us": self.latency.spread_us(),
             "wall_s": wall_s,
         }

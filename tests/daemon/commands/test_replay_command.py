@@ -159,6 +159,10 @@ def test_a_renamed_part_of_a_training_table_is_recognised(bts3_dir: Path, tmp_pa
     verbose = graspd("replay", table, "--verbose").stdout
     assert verbose.index(warning) < verbose.index("40 verdicts in")
     assert summary_of(table)["trained_on"] == ["friday.csv"]
+    (other := tmp_path / "b" / table.name).parent.mkdir()
+    other.write_text("".join(lines[:10]))
+    both = f"{warning}, 9 of 9 grasps of friday.csv"
+    assert graspd("replay", table, other).stdout.splitlines()[1].startswith(both)
     assert summary_of(DEMO_TABLE)["trained_on"] == []
 
 
