@@ -6,12 +6,13 @@ import http.client
 import json
 import re
 import socket
+import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
 
 import pytest
 
-from graspd.daemon.watch.web import ADDRESS, Server, load_page
+from graspd.daemon.watch.web import ADDRESS, CONNECTIONS_MAX, Server, load_page
 from tests.daemon.watch.browser import serving
 
 
@@ -163,6 +164,17 @@ def test_a_browser_silent_within_a_request_is_cut_off(
     with socket.create_connection((ADDRESS, server.server_port), 10) as link:
         link.sendall(begin)
         assert has_ended(link)
+
+
+def test_connections_whose_thread_cannot_start_take_no_place(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as without_threads:
+        without_threads.setattr(threading.Thread, "start", lambda _thread: 1 // 0)
+        for _ in range(CONNECTIONS_MAX):
+            with socket.create_connection((ADDRESS, server.server_port), 10) as link:
+                assert has_ended(link)
+    assert ask(server)[0] == 200
 
 
 def test_closing_the_server_ends_connections_that_wait() -> None:
