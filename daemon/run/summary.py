@@ -239,7 +239,7 @@ class RunSummary:
         if not self.tally.labelled:
             lines.append("no outcome of a lift is known, so there is no score")
         if self.repaired:
-            lines.append(f"{self.repaired} of them with repaired electrodes")
+            lines.append(f"{self.repaired} judged with repaired electrodes")
         lines += _learned(trust)
         lines.append(
             f"reading to verdict: p50 {self.latency.quantile_us(0.5):.0f} us, "
