@@ -105,7 +105,7 @@ function momentOf(minutes, ago) {
   const codes = minutes.history[at], names = LANES.filter(([code]) => codes.includes(code)).map(([, name]) => name);
   const share = minutes.probability[at];
   const probability = share < 0 ? "no slip probability" : `highest slip probability ${percent(share / 100)}`;
-  return `${clock(minutes.t - ago)}: ${names.join(", ") || "not looked at"}; ${probability}`;
+  return `${clock(minutes.t - ago)}: ${names.join(", ") || "watch stood still"}; ${probability}`;
 }
 
 // A lane for each kind of verdict, below it the probability of slip, and the minutes before the end.
