@@ -28,12 +28,12 @@ if TYPE_CHECKING:
 
 
 def read_grasps(path: str | os.PathLike[str], *, read_as: ReadAs | None = None) -> pd.DataFrame:
-    """Return grasps with known outcome: columns `object`, `slipped` and, finger by finger, counts.
+    """Return grasps with known outcome: `object`, `slipped`, and counts, `ff_biotac_1` and so on.
 
     `path`: a grasp table, or a recording (MCAP); `-` is standard input. Pass `read_as="table"`
     for a table in which many rows repeat each other. A missing or damaged count is NaN. Grasps
     without an outcome are left out with a warning; of a recording also those after damage, judged
-    with repaired electrodes, or with the counts of an earlier one. Raises `RecordingError`.
+    with repaired electrodes, or with the counts of another grasp. Raises `RecordingError`.
     """
     with files_of([Path(path)]) as (file,):
         return _grasps(file, read_as)

@@ -266,7 +266,7 @@ class SessionKeeper(SensorWatch):
 
     def _take_up(self, former: KeptSession, *, tared: bool) -> bool:
         """Continue `former`, the session of the new sensors; return False if it cannot be used.
-        `tared`: as in `_begin`, True if the present tare was made with the new sensors."""
+        `tared`: as in `_begin`; False: the present tare is forgotten."""
         trust = former.trust
         learned = None if trust is None else trust.learner
         proves = tared and not is_of_unknown_sensors(former)
@@ -309,7 +309,7 @@ def continue_kept(
 ) -> Continued:
     """Restore calibration and learning at a start of the daemon; return from which sessions.
 
-    `kept`: all kept sessions, the last used first. The first that fits is restored.
+    `kept`: all kept sessions, the last used first. The first that fits is `used`.
     """
     problems: list[str] = []
     used = next((each for each in kept if _continues(pipeline, fingers, each, problems)), None)

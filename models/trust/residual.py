@@ -49,9 +49,9 @@ class Residual:
             self.add(each)
 
     def add(self, inputs: Vector) -> None:
-        """Append a grasp with a known outcome. Its residual is first predicted by the others alone.
+        """Append a grasp with a known outcome; its place in a state is up to the caller.
 
-        In a state the grasp's mean and spread are therefore zeros.
+        With zeros there in mean and spread, the others alone predict its residual.
         """
         # Not a matrix product, whose rounding depends on the other rows.
         squares = np.square(self.grasps - inputs).sum(axis=1, keepdims=True)

@@ -182,7 +182,7 @@ def test_only_lost_frames_are_reported_of_slow_or_lossy_boards(
 def test_two_can_boards_with_one_id_are_distinguished_from_loss(
     boards: Sequence[int], loss: float, cause: Cause, sequence: str
 ) -> None:
-    """`boards`: when each begins, ns."""
+    """`boards`: when each begins, ns. `sequence`: the boards' order of sampling, by name."""
     sent, random = list[tuple[int, CanFrame]](), np.random.default_rng(0)
     for start_ns in boards:
         hand = Hand(100.0)
@@ -254,8 +254,8 @@ def test_bus_off_and_a_can_interface_going_down_are_reported(
 
 
 def told_of(messages: Sequence[object]) -> list[Finding]:
-    """Return the findings, except those that are ok, on a sender whose messages have as `counts`
-    one of `messages` each."""
+    """Return the findings, except those that are ok, on one sender that sends all `messages` in
+    turn, each as the `counts` of a message."""
     statistics = ElectrodeStatistics(FINGERS)
     driver = TactileStreamDriver("udp://127.0.0.1:0", clock=Clock())
     with driver, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
