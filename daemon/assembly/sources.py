@@ -27,11 +27,11 @@ if TYPE_CHECKING:
     from graspd.drivers.recordings.player import LinkLogDriver
 
 DRAWS = "replay"
-"""`boot_id` of a replayed table. It fixes the random draws of the lifts to supervise."""
+"""`boot_id` of a replayed table or link log; it fixes the random draws of lifts to supervise."""
 LINK_LOGS = {Kind.SERIAL: "spi", **dict.fromkeys(CAN_LOGS, "can")}
 """Name of the driver for each kind of link log."""
-LINK_SECTIONS = ("hand", "tactile", "model", "gate", "session")
-"""Sections of a scene that count for a link log, which has neither joints nor outcomes."""
+LINK_SECTIONS = ("hand", "tactile", "model", "gate", "session", "learn", "risk")
+"""Sections of a scene that count for a link log, which has no joints."""
 
 
 class Source:
@@ -162,7 +162,8 @@ class LinkLogs(Source):
             driver = self._driver(replayed, speed)
         except ValueError as error:
             raise SceneError(f"[tactile] {error}") from error
-        return Parts.of(Plan.of(replayed), model, driver, lambda: driver.handed_over_ns)
+        parts = Parts.of(Plan.of(replayed), model, driver, lambda: driver.handed_over_ns)
+        return replace(parts, boot_id=DRAWS)
 
     def _driver(self, replayed: Scene, speed: float | None) -> LinkLogDriver[Any]:
         tactile, fingers = replayed.tactile, replayed.hand.fingers

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.plan import Plan
-from graspd.daemon.assembly.sources import Tables
+from graspd.daemon.assembly.sources import LinkLogs, Tables
 from graspd.daemon.judge.reasons import Decision, Reason
 from graspd.daemon.scene import Scene, SceneError, parse
 from graspd.drivers.base import DriverError, LinkCause, LinkError, RecordingError, TactileReading
@@ -78,6 +78,17 @@ def test_a_replayed_table_measures_age_by_the_drivers_clock() -> None:
         for t_ns, is_stale in ((1_000_000, False), (-(10**10), True)):
             judged = parts.pipeline.judge(replace(cast(TactileReading, first), t_ns=t_ns))
             assert (Reason.STALE in judged.reasons) is is_stale
+
+
+def test_a_replayed_link_log_keeps_the_scenes_risk_and_learning(tmp_path: Path) -> None:
+    log, path = tmp_path / "can.log", tmp_path / "scene.toml"
+    log.write_text("(1700000000.000000) can0 100#0000000000000000\n")
+    path.write_text('[tactile]\ndriver = "can"\n[learn]\nenabled = false\n[risk]\nwarm_up = 7\n')
+    source = LinkLogs([log], path)
+    scene = source.scene({}, {}, None)
+    trust = source.parts(scene, assembly.load_model(scene), None).pipeline.trust
+    assert trust is not None
+    assert (trust.learns, trust.report().warm_up_left) == (False, 7)
 
 
 def hand(fingers: tuple[str, ...], tactile: dict[str, Any] = SPI, **model: str) -> Scene:
