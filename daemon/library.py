@@ -21,7 +21,7 @@ from graspd.biotac import FINGERS, Finger
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Assembly, Parts
 from graspd.daemon.assembly.plan import require_mcap
-from graspd.daemon.assembly.sources import Source, Tables
+from graspd.daemon.assembly.sources import Source, Tables, model_keys
 from graspd.daemon.judge.decision import Limits
 from graspd.daemon.judge.health import at_rail
 from graspd.daemon.run.unjudged import Unjudged
@@ -260,7 +260,8 @@ def load(model: str | os.PathLike[str], *, fingers: Sequence[Finger] = ()) -> Gr
     among `fingers` in this order, and `ValueError` for a name that is not a finger's.
     """
     check_fingers(fingers)
-    found = GraspModel(_path(model, fingers))
+    keys = model_keys(model)
+    found = GraspModel(keys.get("path") or zoo.find(zoo.for_hand(keys["name"], fingers)))
     if fingers and not set(found.fingers).issubset(fingers):
         raise ModelError(f"{found} does not judge a hand of {', '.join(fingers)}")
     if fingers and [each for each in fingers if each in found.fingers] != list(found.fingers):
@@ -286,7 +287,7 @@ def judge(
     said: list[str] = []
     with ExitStack() as stack:
         paths = stack.enter_context(files_of(_files(recordings, stack)))
-        chosen = {} if model is None else {"path": _path(model).absolute()}
+        chosen = {} if model is None else model_keys(model)
         parts = _parts(paths, chosen, read_as, rate_hz)
         pipeline, driver = parts.pipeline, parts.drivers[0]
         why = Unjudged(said.append, parts.scene.gate.fingers)
@@ -390,9 +391,3 @@ def _parts(
     parts = source.parts(scene, assembly.load_model(scene), None)
     source.restore(parts.pipeline)
     return parts
-
-
-def _path(model: str | os.PathLike[str], fingers: Sequence[Finger] = ()) -> Path:
-    if isinstance(model, str) and not model.endswith(".onnx"):
-        return zoo.find(zoo.for_hand(model, fingers) if fingers else model)
-    return Path(model)

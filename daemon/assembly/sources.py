@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -32,6 +33,13 @@ LINK_LOGS = {Kind.SERIAL: "spi", **dict.fromkeys(CAN_LOGS, "can")}
 """Name of the driver for each kind of link log."""
 LINK_SECTIONS = ("hand", "tactile", "model", "gate", "session", "learn", "risk")
 """Sections of a scene that count for a link log, which has no joints."""
+
+
+def model_keys(model: str | os.PathLike[str]) -> dict[str, Any]:
+    """Return the keys of `[model]` for the name of a model or for the path of an ONNX file."""
+    if isinstance(model, str) and not model.endswith(".onnx"):
+        return {"name": model}
+    return {"path": Path(model).absolute()}
 
 
 class Source:
@@ -155,7 +163,8 @@ class LinkLogs(Source):
         if loaded.tactile.driver != driver:
             raise SceneError(f"{path}: tactile.driver must be {driver}")
         written = loaded.model_dump(mode="json", exclude_unset=True)
-        super().__init__({key: written[key] for key in LINK_SECTIONS if key in written}, path)
+        sections = {key: written[key] for key in LINK_SECTIONS if key in written}
+        super().__init__(sections, Path("command line"))  # paths no longer begin at the scene
 
     def parts(self, replayed: Scene, model: TactileModel, speed: float | None) -> Parts:
         try:

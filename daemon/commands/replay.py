@@ -14,7 +14,7 @@ from graspd.biotac import TABLE_FINGERS
 from graspd.daemon.assembly import assembly
 from graspd.daemon.assembly.parts import Assembly, Parts
 from graspd.daemon.assembly.plan import require_mcap
-from graspd.daemon.assembly.sources import LINK_LOGS, LinkLogs, Source, Tables
+from graspd.daemon.assembly.sources import LINK_LOGS, LinkLogs, Source, Tables, model_keys
 from graspd.daemon.commands.arguments import UsageError, add_reading, within
 from graspd.daemon.judge.pipeline import Pipeline
 from graspd.daemon.process.files import require_linux
@@ -307,9 +307,7 @@ def _risk(args: argparse.Namespace) -> dict[str, Any]:
 
 def _parts(args: argparse.Namespace, source: Source) -> Parts:
     """Make the driver and the judge. Raises `SessionFileError` for a session of another hand."""
-    chosen = {}
-    if args.model is not None:
-        chosen["path" if args.model.endswith(".onnx") else "name"] = args.model
+    chosen = {} if args.model is None else model_keys(args.model)
     wanted = source.scene({"endpoint": args.publish}, chosen, args.gate)
     learns = wanted.session.learn and args.session != OFF
     session = wanted.session.model_copy(update={"learn": learns})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,13 +11,18 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 import graspd
+from graspd.daemon.record.mcap import McapWriter
 from graspd.daemon.session.file import SessionFileError
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING
+from graspd.models import zoo
 from graspd.models.contract import ModelError
+from tests.daemon.record.recorded import HEADER
 from tests.daemon.test_library import GIVEN, columns, messages
+from tests.kit.inside import graspd as run
 
 
 def held_streams(folder: Path) -> list[Path]:
@@ -43,6 +49,19 @@ def test_a_stream_is_judged_as_replay_judges_it(
     assert {each["verdict"] for each in got} >= {"stable", "unknown"}
     assert any("sequence-gap" in each["reasons"] for each in got) is (len(paths) > 1)
     assert got == expected
+
+
+@pytest.mark.parametrize("model", ["small-session", "mine.onnx"])
+def test_a_recording_is_judged_by_the_model_that_replay_takes(
+    model: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("run").mkdir()
+    McapWriter(Path("run/run.mcap"), replace(HEADER, fingers=("ff", "th"))).close()
+    shutil.copy(zoo.find("small-session-ff-th"), "mine.onnx")
+    assert "nothing was judged:" in run("replay", "run/run.mcap", "--model", model).stderr
+    with pytest.warns(UserWarning, match="nothing was judged:"):
+        assert not list(graspd.judge("run/run.mcap", model=model))
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
+import shutil
 import tomllib
 from pathlib import Path
 from typing import Any, cast
@@ -19,6 +20,7 @@ from graspd.daemon.scene import Scene, SceneError, parse
 from graspd.drivers.base import DriverError, LinkCause, LinkError, RecordingError, TactileReading
 from graspd.drivers.palm.calibration import CalibrationError
 from graspd.drivers.recordings.csv_player import DEMO_TABLE, ReplayDriver
+from graspd.models import zoo
 from graspd.models.contract import ModelError
 from tests.daemon.fakes import Clock, FakeDriver, reading
 
@@ -80,10 +82,16 @@ def test_a_replayed_table_measures_age_by_the_drivers_clock() -> None:
             assert (Reason.STALE in judged.reasons) is is_stale
 
 
-def test_a_replayed_link_log_keeps_the_scenes_risk_and_learning(tmp_path: Path) -> None:
-    log, path = tmp_path / "can.log", tmp_path / "scene.toml"
+def test_a_replayed_link_log_is_judged_as_its_scene_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    log, path = Path("can.log"), Path("sub", "scene.toml")
+    path.parent.mkdir()
     log.write_text("(1700000000.000000) can0 100#0000000000000000\n")
-    path.write_text('[tactile]\ndriver = "can"\n[learn]\nenabled = false\n[risk]\nwarm_up = 7\n')
+    shutil.copy(zoo.find("small-session"), "sub/mine.onnx")
+    sections = "[learn]\nenabled = false\n[risk]\nwarm_up = 7\n"
+    path.write_text(f'[tactile]\ndriver = "can"\n[model]\npath = "mine.onnx"\n{sections}')
     source = LinkLogs([log], path)
     scene = source.scene({}, {}, None)
     trust = source.parts(scene, assembly.load_model(scene), None).pipeline.trust
