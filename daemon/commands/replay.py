@@ -39,7 +39,6 @@ from graspd.drivers.recordings.kinds import (
     PAGE,
     Kind,
     files_of,
-    kind_of,
     kind_of_all,
     refuse_options,
 )
@@ -167,10 +166,6 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("--wait is for subscribers: it needs --publish")
     if args.publish is not None:
         require_linux("--publish")
-    if args.only_lifted and args.recordings and not args.outcomes:
-        raise UsageError("--only-lifted says which outcomes are told: it needs --outcomes")
-    if args.max_slip_when_stable and args.recordings and not args.outcomes:
-        raise UsageError("--max-slip-when-stable rests on outcomes: it needs --outcomes")
     try:
         with StopSignal() as stop, files_of(args.recordings) as args.recordings:
             return _replay(args, stop)
@@ -260,11 +255,16 @@ def _source(args: argparse.Namespace) -> Source:
     kind = kind_of_all(args.recordings)
     given = {"--loop": args.loop, "--strict": args.strict, "--as": args.read_as}
     refuse_options(args.recordings[0], kind, given | {"--rate-hz": args.rate_hz})
+    if args.scene is not None and kind not in LINK_LOGS:
+        problem = f"is {kind.value}: --scene is for what came over a link"
+        raise UsageError(
+            f"{args.recordings[0]}: {problem}; {PAGE} lists the CAN logs that are read"
+        )
     if kind is Kind.TEXT or kind in BAGS:
         return _tables(args)
-    if args.outcomes or args.min_confidence is not None or _risk(args):
+    if args.outcomes or args.only_lifted or args.min_confidence is not None or _risk(args):
         raise UsageError(
-            "what graspd has recorded is judged under its own risk: no --outcomes, "
+            "what graspd has recorded is judged under its own risk: no --outcomes, --only-lifted, "
             "--max-slip-when-stable, --warm-up, --explore or --min-confidence"
         )
     if kind in LINK_LOGS:
@@ -277,10 +277,10 @@ def _source(args: argparse.Namespace) -> Source:
 
 def _tables(args: argparse.Namespace) -> Tables:
     """Return the tables, with the options of the command line for judging them."""
-    if args.scene is not None:
-        first = args.recordings[0]
-        problem = f"is {kind_of(first).value}: --scene is for what came over a link"
-        raise UsageError(f"{first}: {problem}; {PAGE} lists the CAN logs that are read")
+    if args.only_lifted and not args.outcomes:
+        raise UsageError("--only-lifted says which outcomes are told: it needs --outcomes")
+    if args.max_slip_when_stable and not args.outcomes:
+        raise UsageError("--max-slip-when-stable rests on outcomes: it needs --outcomes")
     sections: dict[str, dict[str, Any]] = {}
     if args.min_confidence is not None:
         sections["model"] = {"min_confidence": args.min_confidence}
