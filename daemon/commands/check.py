@@ -74,6 +74,9 @@ def _shared(first: scene.Scene, second: scene.Scene) -> Iterator[str]:
     for what, name in _taken(first):
         if taken.get(what) == name:
             yield f"{what} {name}"
+    for (table, device), (_, other) in itertools.product(_devices(first), _devices(second)):
+        if _is_one(device, other):
+            yield f"{table}.{device.keys} {device.name} {device.part}".rstrip()
     for ends in itertools.product(_endpoints(first), _endpoints(second)):
         if clash(*ends):
             yield f"endpoint {ends[0]}"
@@ -84,13 +87,10 @@ def _endpoints(wanted: scene.Scene) -> list[str]:
 
 
 def _taken(wanted: scene.Scene) -> Iterator[tuple[str, str]]:
-    """Yield key and name of each resource, except endpoints, that a running scene claims."""
+    """Yield key and name of each resource, except devices and endpoints, that a scene claims."""
     yield "hand.name", wanted.hand.name
     if wanted.keeps_session:
         yield "session.folder", os.path.realpath(wanted.session_path)
-    for table, device in _devices(wanted):
-        name = os.path.realpath(device.name) if device.kind is DeviceKind.SERIAL else device.name
-        yield f"{table}.{device.keys}", f"{name} {device.part}".rstrip()
 
 
 def _devices(wanted: scene.Scene) -> Iterator[tuple[str, Device]]:
@@ -98,6 +98,18 @@ def _devices(wanted: scene.Scene) -> Iterator[tuple[str, Device]]:
     for table, section in (("tactile", wanted.tactile), ("joints", wanted.joints)):
         if section is not None and section.device is not None:
             yield table, section.device
+
+
+def _is_one(device: Device, other: Device) -> bool:
+    """Return True if two drivers cannot both take these devices."""
+    if device.kind is not other.kind:
+        return False
+    if device.kind is DeviceKind.UDP:
+        ends = Endpoint.parse(device.name), Endpoint.parse(other.name)
+        return ends[0].port > 0 and clash(*map(str, ends))
+    if device.part and other.part and device.part != other.part:
+        return False
+    return os.path.realpath(device.name) == os.path.realpath(other.name)
 
 
 def _check(path: Path, *, as_json: bool) -> scene.Scene | None:

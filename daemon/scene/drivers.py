@@ -169,7 +169,8 @@ class CanTactile(DriverSection):
     def device(self) -> Device:
         """Return the bus, as a `Device`; two drivers can share it if their frames' ids differ."""
         kind = BUS_KINDS.get(self.interface, DeviceKind.BUS)
-        return Device(kind, self.channel, "channel and arbitration_id", str(self.arbitration_id))
+        part = "" if self.arbitration_id is None else f"{self.arbitration_id:#x}"
+        return Device(kind, self.channel, "channel and arbitration_id", part)
 
 
 class UdpSection(DriverSection):

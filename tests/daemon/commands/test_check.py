@@ -91,13 +91,22 @@ TWO = '[hand]\nname = "{}"\n[tactile]\ndriver = {}\n[publish]\nendpoint = "{}"\n
             ["hand.name", "session.folder"],
         ),
         ("left", '"spi"\nport = "/dev/../dev/a"', "tcp://127.0.0.1:6001", ["tactile.port"]),
+        (
+            "left",
+            '"can"\ninterface = "slcan"\nchannel = "/dev/a"\narbitration_id = 1',
+            "tcp://127.0.0.1:6001",
+            ["tactile.port"],
+        ),
+        ("left", '"palm"\nsource = "udp://0.0.0.0:98"', "tcp://127.0.0.1:6001", ["joints.source"]),
         ("left", '"can"', "tcp://[::ffff:127.0.0.1]:6000", ["endpoint"]),
     ],
 )
 def test_check_says_what_two_scenes_cannot_share(
     tmp_path: Path, hand: str, tactile: str, endpoint: str, shared: list[str]
 ) -> None:
-    right = written(tmp_path, TWO.format("right", '"spi"\nport = "/dev/a"', "tcp://127.0.0.1:6000"))
+    text = TWO.format("right", '"spi"\nport = "/dev/a"', "tcp://127.0.0.1:6000")
+    joints = '[joints]\ndriver = "stream"\nsource = "udp://127.0.0.1:98"\n'
+    right = written(tmp_path, text + joints)
     other = tmp_path / "other.toml"
     other.write_text(TWO.format(hand, tactile, endpoint))
     result = graspd("check", right, other)
