@@ -106,8 +106,10 @@ def run(args: argparse.Namespace) -> int:
     else:
         columns = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
         write_lines(*map(_coloured, in_words(findings, columns)))
-        if args.all and report.get("readings"):
-            write_lines(*_table(report["electrodes"], columns or USUAL_COLUMNS))
+        for device, heard in report.get("bridges", {"": report}).items():
+            if args.all and heard.get("readings"):
+                table = _table(heard["electrodes"], columns or USUAL_COLUMNS)
+                write_lines(*(["", device] if device else []), *table)
     return int(any(finding.level is Level.ERROR for finding in findings))
 
 
@@ -166,18 +168,23 @@ def in_words(findings: Sequence[Finding], columns: int | None) -> Iterator[str]:
 
 def _computer(report: dict[str, Any], listen_s: float) -> list[Finding]:
     """Return findings on this computer's bridges and CAN interfaces; enter them in `report`, too,
-    with all USB serial ports, but of several bridges only what the last one said."""
+    with all USB serial ports. If there are several bridges, each has its part in `bridges`."""
     ports = [port for port in computer.serial_ports() if port.vendor is not None]
     interfaces = computer.can_interfaces()
     report["ports"] = [dataclasses.asdict(port) for port in ports]
     report["interfaces"] = [dataclasses.asdict(interface) for interface in interfaces]
-    findings = []
+    findings, bridges = [], {}
     for port in ports:
         if BRIDGE_NAME in port.product.lower() or port.vendor == BRIDGE_VENDOR:
-            tactile = {"tactile": {"driver": "spi", "port": port.device}}
-            findings += _listen(scene.parse(tactile, Path(port.device)), report, listen_s)
+            bridges[port.device] = dict[str, Any]()
         else:
             findings.append(fine(f"{port}; not greeted: to ask it, name it in a scene"))
+    for device, heard in bridges.items():
+        tactile = {"tactile": {"driver": "spi", "port": device}}
+        told = _listen(scene.parse(tactile, Path(device)), heard, listen_s)
+        which = f"{device}: " if len(bridges) > 1 else ""
+        findings += [dataclasses.replace(each, what=which + each.what) for each in told]
+    report |= {"bridges": bridges} if len(bridges) > 1 else next(iter(bridges.values()), {})
     findings += [can_finding(interface) for interface in interfaces]
     if not findings:
         what = "no USB serial port and no CAN interface"

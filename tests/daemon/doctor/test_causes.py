@@ -30,6 +30,7 @@ from tests.daemon.doctor.emulated import CAN, FINGERS, SPI, asked, look, refused
 from tests.daemon.processes import start
 from tests.drivers.can.can_standin import LOOPBACK, SocketBus, sweep_of_frames
 from tests.kit.clock import Clock
+from tests.kit.inside import graspd
 from tests.kit.waiting import wait_until
 from tests.ports import free_port
 
@@ -319,6 +320,19 @@ def test_rights_that_a_user_lacks_are_reported(
     assert mine.keys() == {"socket-denied", "socket-group", "realtime"}
     assert mine["socket-group"] == "sudo usermod -aG daemon $USER, then log in again"
     assert "LimitRTPRIO=40" in str(told)
+
+
+def test_what_is_heard_of_two_bridges_is_told_apart(
+    healthy: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    there, absent = str(tmp_path / "bridge"), str(tmp_path / "absent")
+    ports = [computer.SerialPort(name, "n/a", None, 1, "graspd") for name in (there, absent)]
+    monkeypatch.setattr(computer, "serial_ports", lambda: ports)
+    report = json.loads(graspd("doctor", "--listen", 1, "--json").stdout)
+    assert report["bridges"][there]["readings"] > report["bridges"][absent]["readings"] == 0
+    wrong = [each["what"] for each in report["findings"] if each["cause"] == "port-missing"]
+    assert [what.startswith(f"{absent}: ") for what in wrong] == [True]
+    assert f"\n\n{there}\n\n" in graspd("doctor", "--listen", 1, "--all").stdout
 
 
 def test_option_all_prints_electrodes_within_80_columns(tmp_path: Path, healthy: str) -> None:
