@@ -74,6 +74,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Show until stopped; return 1 if the port is not available. Raises `UsageError`."""
+    if args.server_key is not None and args.keys is None:
+        raise UsageError("--server-key is for a daemon with [curve]: it needs --keys")
+    if args.port is not None and not (args.web or args.foxglove):
+        raise UsageError("--port needs --web or --foxglove")
     if hasattr(os, "nice"):
         os.nice(NICENESS)
     with contextlib.ExitStack() as stack:

@@ -108,6 +108,8 @@ COMMANDS: Final[Mapping[str, str]] = {
     "watch-no-terminal": "watch --connect ipc:///tmp/x",
     "watch-wrong-endpoint": "watch --connect nonsense",
     "watch-no-server-key": "watch --connect tcp://127.0.0.1:1 --keys x",
+    "watch-server-key-alone": "watch --connect ipc:///tmp/x --server-key x",
+    "watch-port-alone": "watch --connect ipc:///tmp/x --port 9",
     "watch-web-wrong-port": "watch --connect ipc:///tmp/x --port 0 --web",
     "watch-both": "watch --connect ipc:///tmp/x demo.toml",
     "watch-absent": "watch absent.toml",
