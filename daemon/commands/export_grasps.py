@@ -117,7 +117,7 @@ def _summary(export: Export) -> str:
 def _why(export: Export) -> str:
     """Return why there is no grasp, in words."""
     if export.repaired:
-        return "all were judged with repaired electrodes"
+        return "all with an outcome were judged with repaired electrodes"
     if export.without_outcome:
         return "the controller told no outcome"
     if export.unjoined:
