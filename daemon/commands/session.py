@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import os
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -86,9 +87,10 @@ def run(args: argparse.Namespace) -> int:
     if args.action == "show":
         return _show(wanted, model, as_json=args.json)
     if args.action == "settle":
-        _settle(wanted, model, args.lifts, args.told)
+        _settle(wanted, model, list(dict.fromkeys(args.lifts)), args.told)
     elif args.action == "reset":
-        with SessionFolder(wanted.session_path) as folder:
+        folder = SessionFolder(wanted.session_path)
+        with folder if os.path.isdir(folder.path) else contextlib.nullcontext():  # locking makes it
             result = "forgotten" if folder.remove() else "no session was kept"
         write_lines(f"{printable(str(wanted.session_path))}: {result}")
     else:
@@ -115,13 +117,9 @@ def _show(wanted: scene.Scene, model: TactileModel, *, as_json: bool) -> int:
             {"file": f"{n}{ENDING}", **msgspec.to_builtins(one), "trust": _learned(one.trust)}
             for n, one in sessions.items()
         ]
-        document = {
-            "folder": str(path),
-            "calibrated": calibrated,
-            "session": documents[0] if documents else None,
-            "others": documents[1:],
-        }
-        write_json(document)
+        session = documents[0] if documents else None
+        kept = {"session": session, "others": documents[1:]}
+        write_json({"folder": str(path), "calibrated": calibrated, **kept})
     else:
         write_lines(*_lines(path, sessions, model, calibrated))
     return 2 if len(sessions) < len(found) else 0
@@ -262,7 +260,8 @@ def _settle(wanted: scene.Scene, model: TactileModel, names: list[str], told: st
     sensors is open in the files of both sensors' sessions.
     """
     path, trust = wanted.session_path, assembly.build_pipeline(Plan.of(wanted), model).trust
-    with SessionFolder(path) as folder:
+    folder = SessionFolder(path)
+    with folder if os.path.isdir(path) else contextlib.nullcontext():  # locking makes it
         found = _readable(look(path))
         mine = {number: kept for number, kept in found.items() if kept.model == model.sha256}
         if trust is None or not mine:

@@ -26,6 +26,9 @@ def test_a_session_is_seeded_shown_used_and_forgotten(scene: Path, bts3_dir: Pat
     recording = bts3_dir / "palm_45.csv"
     shown = graspd("session", "show", scene)
     assert (shown.returncode, shown.stdout.count("no session is kept")) == (0, 1)
+    assert "no session was kept" in output("session", "reset", scene)
+    assert "no lifts are kept" in refused("session", "settle", scene)
+    assert not (scene.parent / "right").exists()  # root would shut the service out
     seeded = graspd("session", "seed", scene, recording)
     assert (seeded.returncode, seeded.stderr) == (0, "")  # cnn1-session has not seen palm_45
     grasps = int(re.search(r": (\d+) grasps of 2133 readings", seeded.stdout)[1])  # type: ignore[index]

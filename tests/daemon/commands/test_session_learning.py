@@ -170,8 +170,9 @@ def test_settling_announced_lifts_learns_as_if_their_controller_reported(tmp_pat
     assert graspd("session", "settle", path).stdout.splitlines()[1:] == names
     problem = refused("session", "settle", path, "01234567-9", "--as", "held")
     assert "01234567-9: not open" in problem
-    for told, lifts in (("slipped", names[:1]), ("not-lifted", names[1:3]), ("held", ())):
-        output("session", "settle", path, *lifts, "--as", told)
+    for told, lifts, number in (("slipped", [0, 0], 1), ("not-lifted", [1, 2], 2), ("held", (), 2)):
+        said = output("session", "settle", path, *(names[lift] for lift in lifts), "--as", told)
+        assert f": {number} lifts {told}" in said
     for number, slipped in ((1, True), (4, False), (5, False)):
         trust.outcome(GraspId(boot, number), slipped=slipped)
     now, found = last_kept(kept), live_trust(path)
