@@ -285,26 +285,30 @@ def judge(
     judged. Raises `SceneError`, `RecordingError`, `ModelError` or `ValueError`.
     """
     said: list[str] = []
-    with ExitStack() as stack:
-        paths = stack.enter_context(files_of(_files(recordings, stack)))
-        chosen = {} if model is None else model_keys(model)
-        parts = _parts(paths, chosen, read_as, rate_hz)
-        pipeline, driver = parts.pipeline, parts.drivers[0]
-        why = Unjudged(said.append, parts.scene.gate.fingers)
-        around = Assembly(parts, stack)
-        outbox = around.build_outbox()
-        around.open_drivers()
-        while not driver.exhausted:
-            for reading in driver.read_ready():
-                why.on_reading(reading)
-                if isinstance(reading, JointReading):
-                    pipeline.observe_joints(reading)
-                    continue
-                received_ns = time.monotonic_ns()
-                judgement = pipeline.judge(reading)
-                why.add(judgement, reading.made_ns)
-                yield outbox.verdict(judgement, received_ns, assembly.NO_SILENCE_NS)[0]
-                pipeline.learn()
+    try:
+        with ExitStack() as stack:
+            paths = stack.enter_context(files_of(_files(recordings, stack)))
+            chosen = {} if model is None else model_keys(model)
+            parts = _parts(paths, chosen, read_as, rate_hz)
+            pipeline, driver = parts.pipeline, parts.drivers[0]
+            why = Unjudged(said.append, parts.scene.gate.fingers)
+            around = Assembly(parts, stack)
+            outbox = around.build_outbox()
+            around.open_drivers()
+            while not driver.exhausted:
+                for reading in driver.read_ready():
+                    why.on_reading(reading)
+                    if isinstance(reading, JointReading):
+                        pipeline.observe_joints(reading)
+                        continue
+                    received_ns = time.monotonic_ns()
+                    judgement = pipeline.judge(reading)
+                    why.add(judgement, reading.made_ns)
+                    yield outbox.verdict(judgement, received_ns, assembly.NO_SILENCE_NS)[0]
+                    pipeline.learn()
+    except (RecordingError, SceneError, ValueError) as error:
+        error.args = (_in_arguments(str(error)),)
+        raise
     why.end(driver.counters)
     if said:
         warnings.warn("\n".join(dict.fromkeys(said)), stacklevel=2)
@@ -362,7 +366,7 @@ def _named_as_given(path: Path) -> Iterator[None]:
     try:
         yield
     except (RecordingError, SceneError) as error:
-        raise ValueError(_in_arguments(of_table(str(error)))) from None
+        raise ValueError(of_table(str(error))) from None
     finally:
         log.removeFilter(rename)
 
@@ -371,7 +375,7 @@ def _in_arguments(said: str) -> str:
     """Return an error's text with arguments of `judge` in place of command-line options."""
     for option, argument in ARGUMENTS.items():
         said = said.replace(option, argument)
-    return said
+    return said.removeprefix("command line: tactile.")
 
 
 def _parts(

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 import graspd
 from graspd.daemon.record.mcap import McapWriter
 from graspd.daemon.session.file import SessionFileError
+from graspd.drivers.base import RecordingError
 from graspd.drivers.recordings.csv_player import DEMO_RECORDING
 from graspd.models import zoo
 from graspd.models.contract import ModelError
@@ -143,7 +144,7 @@ def test_text_that_no_csv_can_hold_does_not_hinder_judging(text: str) -> None:
     assert told[0] == told[1]
 
 
-def test_sweeps_without_times_are_refused_as_grasps() -> None:
+def test_sweeps_without_times_are_refused_as_grasps(tmp_path: Path) -> None:
     pytest.importorskip("pandas", reason="needs the extra `pandas`")
     sweeps = graspd.read_recording(DEMO_RECORDING)[:260].drop(columns="t")
     model = graspd.load("mlp")
@@ -152,6 +153,9 @@ def test_sweeps_without_times_are_refused_as_grasps() -> None:
             list(judge(sweeps))
         with pytest.raises(ValueError, match="they change as sweeps of a stream do"):
             list(judge(sweeps, read_as="table"))
+    sweeps.to_csv(tmp_path / "sweeps.csv", index=False)
+    with pytest.raises(RecordingError, match=r"\(read_as=stream, and rate_hz= if it has no times"):
+        list(graspd.judge(tmp_path / "sweeps.csv"))
     as_stream: Any = "stream"
     with pytest.raises(ValueError, match="'stream': a GraspModel judges grasps"):
         model.predict(sweeps[:9], read_as=as_stream)
