@@ -16,6 +16,7 @@ from graspd.daemon.process.signals import stopping
 from graspd.daemon.process.text import complain, write_json
 from graspd.drivers.base import DriverError
 from graspd.drivers.biotac import SEQUENCES
+from graspd.drivers.can.frames import EXTENDED_ID_MAX
 from graspd.drivers.twins.faults import LinkFaults
 from graspd.drivers.twins.grasps.grasps import Counts, recorded_counts
 from graspd.drivers.twins.grasps.whole_grasps import PALM_RATE_HZ, synthetic_grasps
@@ -68,7 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     can.add_argument(
         "--arbitration-id",
-        type=lambda text: int(text, 0),
+        type=_frame_id,
         metavar="ID",
         default=0x100,
         help="of its frames (default: 0x100)",
@@ -102,6 +103,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         kind.add_argument("--loop", action="store_true", help="play recordings for ever")
     for kind in (spi, can, palm, joints, datagrams):
         _add_faults(kind)
+
+
+def _frame_id(text: str) -> int:
+    try:
+        number = int(text, 0)
+    except ValueError:
+        number = -1
+    if not 0 <= number <= EXTENDED_ID_MAX:
+        raise argparse.ArgumentTypeError(f"{text} is not an id of 0 to {EXTENDED_ID_MAX:#x}")
+    return number
 
 
 def _add_faults(parser: argparse.ArgumentParser) -> None:

@@ -117,6 +117,7 @@ COMMANDS: Final[Mapping[str, str]] = {
     "twin-unknown": "twin hand",
     "twin-drop": "twin spi --drop 2",
     "twin-dead": "twin spi --dead th",
+    "twin-can-id": "twin can --arbitration-id 0x20000000",
     "twin-mistyped": "twin spi --stuk-clock",
     "twin-other-fault": "twin palm --one-byte-at-a-time",
     **{
