@@ -94,8 +94,6 @@ def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
         raise SystemExit(WRONG)
     args = parser.parse_args(arguments)
     logs.set_up(os.environ)
-    if args.command != named:
-        parser.error(f"'{args.command}' must come first")
 
     def run() -> int:
         try:
