@@ -235,8 +235,8 @@ def _on_socketcan(finding: Finding, tactile: CanTactile) -> list[Finding]:
 def _of_socket(name: str, path: Path) -> Iterator[Finding]:
     folder = path.parent
     holders = computer.file_holders(f"{path}.lock")
-    if not _is_reached(folder):
-        what, advice = f"{name}: you may not enter {folder.parent}", "Choose a folder of your own."
+    if shut := _shut(folder):
+        what, advice = f"{name}: you may not enter {shut}", "Choose a folder of your own."
         yield Finding(Level.WARNING, what, Cause.SOCKET_DENIED, advice)
     elif not os.path.isdir(folder):
         what = f"{name}: there is no folder {folder}"
@@ -256,13 +256,16 @@ def _of_socket(name: str, path: Path) -> Iterator[Finding]:
         yield Finding(Level.WARNING, what, Cause.SOCKET_DENIED, advice)
 
 
-def _is_reached(path: Path) -> bool:
-    """Return False if a folder on the way to `path` may not be entered; True if one is missing."""
-    try:
-        path.stat()
-    except OSError as error:  # a missing path is another finding
-        return not isinstance(error, PermissionError)
-    return True
+def _shut(path: Path) -> Path | None:
+    """Return the first folder on the way to `path` that may not be entered; None without any."""
+    for each in (*reversed(path.parents), path):
+        try:
+            each.stat()
+        except PermissionError:
+            return each.parent
+        except OSError:  # a missing path is another finding
+            return None
+    return None
 
 
 def _of_port(name: str, address: str) -> Iterator[Finding]:
