@@ -89,7 +89,7 @@ class Health:
     def __init__(self, fingers: int) -> None:
         self._shape = shape = (fingers, ELECTRODES)
         self._previous = np.full(shape, NO_COUNT, dtype=np.uint16)
-        """Counts of the last reading, shape (fingers, 24), as the arrays that follow."""
+        """Last count of each electrode that was read, shape (fingers, 24), as what follows."""
         self._number = 0
         """Number of readings until now."""
         self._changed = np.zeros(shape, dtype=np.int64)
@@ -118,15 +118,16 @@ class Health:
         if counts.shape != self._shape:
             return Checked((Reason.MODEL_MISMATCH,), np.ones(self._shape, dtype=np.bool_))
         self._faults = reading.faults
-        railed = self._compare(counts)
         sound, faults = None, 0
         # Nearly all readings are sound, which a few cheap operations find out.
-        if reading.faults.tobytes() != self._no_faults:
-            # Flagged counts were not read, so they take no part in the search for repeats.
+        if reading.faults.tobytes() == self._no_faults:
+            railed = self._compare(counts)
+        else:
+            # Flagged counts were not read, so they neither jump nor repeat a sweep.
             sound = reading.faults == 0
             faults = int(np.bitwise_or.reduce(reading.faults, axis=None))
+            railed = self._compare(np.where(sound, counts, self._previous)) & sound
             self._changed[~sound] = self._number
-            railed &= sound
         broken = railed | self._worn_out()
         if sound is not None:
             broken |= ~sound
@@ -160,7 +161,10 @@ class Health:
         return findings
 
     def _compare(self, counts: NDArray[np.uint16]) -> NDArray[np.bool_]:
-        """Note which counts changed or jumped since the last reading; return those at a rail."""
+        """Note which counts changed or jumped since the last reading; return those at a rail.
+
+        `counts`: the last count of an electrode stands for one that was not read.
+        """
         previous = self._previous
         self._number += 1
         above = self._above

@@ -109,6 +109,16 @@ def test_a_jump_counts_only_while_twenty_others_keep_still(
     assert ((1, 0) in found[-1]) == jumpy
 
 
+def test_samples_that_were_not_read_do_not_jump() -> None:
+    health = Health(len(FINGERS))
+    for place in range(20):
+        reading = flat(2000 + place)
+        if place % 2:
+            reading.counts[1, 4], reading.faults[1, 4] = 0, ElectrodeFault.MISSING
+        checked = health.check(reading)
+        assert broken_of(checked).sum() == broken_of(checked)[1, 4] == place % 2
+
+
 def test_an_electrode_unchanged_for_16_readings_is_dead() -> None:
     steps = steps_of(40, {})
     steps[:16, 0] = 0
