@@ -86,7 +86,9 @@ SOUND = Checked((), None)
 class Health:
     """Finds broken electrodes and repeated sweeps by comparing each reading with those before."""
 
-    def __init__(self, fingers: int) -> None:
+    def __init__(self, fingers: int, *, stream: bool = True) -> None:
+        """`stream`: False if each reading is another grasp, so that one may recur."""
+        self._stream = stream
         self._shape = shape = (fingers, ELECTRODES)
         self._previous = np.full(shape, NO_COUNT, dtype=np.uint16)
         """Last count of each electrode that was read, shape (fingers, 24), as what follows."""
@@ -131,7 +133,7 @@ class Health:
         broken = railed | self._worn_out()
         if sound is not None:
             broken |= ~sound
-        repeats = self._recurs(counts, sound)
+        repeats = self._stream and self._recurs(counts, sound)
         if faults & ~REPAIRABLE:  # flagged counts mean nothing: no further findings on them
             return Checked(_fault_reasons(faults), broken)
         if repeats:

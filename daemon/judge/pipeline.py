@@ -98,7 +98,7 @@ class Pipeline:
         self.needs_session = needs_session
         """True if nothing is judged before the session is calibrated."""
         self._fingers = model.contract.fingers
-        self._health = Health(len(fingers))
+        self._health = Health(len(fingers), stream=hand is not None)
         self.trust = trust
         """Learning and risk; None: without learning and without a risk."""
         self.lifts = LiftBook() if trust is None else trust.lifts
