@@ -72,8 +72,8 @@ class MotionLimits:
         self.fast = self.slow = self._ones
         """Largest motion of each finger over the short and over the long window."""
         self.early = self.sure = False
-        """`early`: all fingers are within `fast`. `sure`: within `slow` and, in the short window,
-        within the limit of `Tails.fast`, which is looser than `fast` with `early` judging."""
+        """`early`: all fingers are within `fast`. `sure`: within both; with `early` judging `fast`
+        is the looser limit of `Tails.fast` then, as the short window does not decide alone."""
 
     def lay(
         self,
@@ -93,10 +93,12 @@ class MotionLimits:
             self.slow, self.sure = self._ones, False
             return
         self.slow = self._slow_limits(slow_noise)
-        is_within = self.early
-        if self._beside != self._alone:  # the short window is looser where the long one decides
-            is_within = all(map(le, fast, _fast_limits(self._beside, fast_noise)))
-        self.sure = is_within and all(map(le, slow, self.slow))
+        self.sure = all(map(le, slow, self.slow))
+        if self.sure and self._beside != self._alone:
+            beside = _fast_limits(self._beside, fast_noise)
+            if all(map(le, fast, beside)):
+                self.fast, self.early = beside, True
+        self.sure &= self.early
 
     def _slow_limits(self, slow_noise: SlowNoise) -> list[float]:
         extent, squares, spreads = slow_noise
