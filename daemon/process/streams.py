@@ -52,8 +52,19 @@ class _Raw(io.FileIO):
             raise
 
 
+class _Lossy(io.FileIO):
+    """A raw stream that drops what it cannot write."""
+
+    def write(self, data: ReadableBuffer, /) -> int:
+        try:
+            return super().write(data)
+        except OSError:
+            return memoryview(data).nbytes
+
+
 def _take_over() -> _Raw:
-    """Replace `sys.stdout`, and `sys.stderr` if it is closed; return the raw stream of stdout."""
+    """Replace `sys.stdout` and `sys.stderr`, which drops what it cannot write; return the raw
+    stream of stdout."""
     former = sys.stdout
     if isinstance(former, io.TextIOWrapper):
         descriptor = former.fileno()
@@ -66,10 +77,12 @@ def _take_over() -> _Raw:
     sys.stdout = io.TextIOWrapper(
         io.BufferedWriter(raw), encoding, "backslashreplace", line_buffering=at_once
     )
-    if not isinstance(sys.stderr, io.TextIOWrapper):
-        sys.stderr = io.TextIOWrapper(
-            io.FileIO(os.open(os.devnull, os.O_WRONLY), "wb"), "utf-8", line_buffering=True
-        )
+    if isinstance(sys.stderr, io.TextIOWrapper):
+        descriptor, encoding = sys.stderr.fileno(), sys.stderr.encoding
+    else:
+        descriptor, encoding = os.open(os.devnull, os.O_WRONLY), "utf-8"
+    errors = io.BufferedWriter(_Lossy(descriptor, "wb", closefd=False))
+    sys.stderr = io.TextIOWrapper(errors, encoding, "backslashreplace", line_buffering=True)
     return raw
 
 

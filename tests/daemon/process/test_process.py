@@ -179,8 +179,9 @@ def test_a_daemon_runs_with_all_standard_streams_closed(tmp_path: Path) -> None:
     assert redirected("<&- >&- 2>&-", "run", scene) == (0, "", "")
 
 
-def test_a_closed_stderr_does_not_change_the_exit_code() -> None:
-    assert redirected("2>&-", "run", "absent.toml") == (2, "", "")
+@pytest.mark.parametrize("redirection", ["2>&-", "2>/dev/full"])
+def test_a_closed_or_full_stderr_does_not_change_the_exit_code(redirection: str) -> None:
+    assert redirected(redirection, "run", "absent.toml") == (2, "", "")
 
 
 def test_a_broken_pipe_other_than_stdout_is_not_silent() -> None:
