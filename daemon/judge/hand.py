@@ -228,7 +228,7 @@ class HandTracker:
     def observe_joints(self, reading: JointReading) -> None:
         """Take in joint angles."""
         if self._joints is not None:
-            self._joints.observe(reading, reading.made_ns)
+            self._joints.observe(reading)
 
     def step(
         self,

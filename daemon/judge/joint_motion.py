@@ -46,11 +46,12 @@ class JointMotion:
         self._changed_ns: int | None = None
         """Time of the last change of any angle. None: no angle came yet."""
 
-    def observe(self, reading: JointReading, t_ns: int) -> None:
-        """Take in angles made at `t_ns`, on the same clock as the sweeps.
+    def observe(self, reading: JointReading) -> None:
+        """Take in angles, whose time is on the same clock as the sweeps'.
 
         A joint whose angle is NaN counts as not sent: it is judged by the angles before and after.
         """
+        t_ns = reading.made_ns
         for name, angle in zip(reading.names, reading.position_rad.tolist(), strict=True):
             if not math.isnan(angle):
                 self._take(name, angle, t_ns)

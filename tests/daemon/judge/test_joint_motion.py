@@ -26,7 +26,7 @@ NOISE_RAD = 1e-9
 
 def send(motion: JointMotion, t_ns: int, *angles: float, names: tuple[str, ...] = NAMES) -> None:
     measured = np.array(angles) + NOISE_RAD * np.sin(t_ns / MS)
-    motion.observe(JointReading(t_ns, 0, names, measured), t_ns)
+    motion.observe(JointReading(t_ns, 0, names, measured))
 
 
 def turning(rate_hz: float, rad_per_s: float, seconds: float = 1.0) -> tuple[JointMotion, int]:
@@ -240,7 +240,7 @@ def frozen(
     found = None
     for ms in np.arange(begin_ms, end_ms + 0.5, period_ms).tolist():
         t_ns = START_NS + round(ms * MS)
-        motion.observe(JointReading(t_ns, 0, NAMES, np.full(len(NAMES), 0.8)), t_ns)
+        motion.observe(JointReading(t_ns, 0, NAMES, np.full(len(NAMES), 0.8)))
         found = motion.objection(t_ns)
     return found
 
