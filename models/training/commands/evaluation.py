@@ -55,8 +55,8 @@ from graspd.models.training.systems.registry import (
 SEEDS = 3
 """Number of split seeds of an evaluation unless `--seeds` says otherwise."""
 QUICK_GRASPS, QUICK_FOLDS, QUICK_EPOCHS = 200, 2, 1
-"""Grasps, folds and epochs of `--quick`, which only tests that all runs; figures mean nothing."""
-
+"""Grasps (as many of each table), folds and epochs of `--quick`, which only tests that all runs;
+figures mean nothing."""
 
 CONNECT_TIMEOUT_S = 10
 VERDICTS = "verdicts"
@@ -76,11 +76,14 @@ def evaluate(args: argparse.Namespace) -> None:
     check_fingers(systems, grasps)
     if args.quick:
         systems = [with_recipes(system, epochs=QUICK_EPOCHS) for system in systems]
-        chosen = np.random.default_rng(0).permutation(len(grasps))[:QUICK_GRASPS]
-        grasps = grasps.rows(np.sort(chosen).astype(np.int64))
+        random, tables = np.random.default_rng(0), range(len(grasps.files))
+        each = -(-QUICK_GRASPS // len(tables))
+        rows = [np.flatnonzero(grasps.table_of == table) for table in tables]
+        chosen = np.concatenate([random.permutation(some)[:each] for some in rows])
+        grasps = grasps.rows(np.sort(chosen))
     protocols = _protocols(args, grasps)
     folds = QUICK_FOLDS if args.quick else FOLDS
-    if args.data is None:
+    if args.own:
         folds = _enough_folds(systems, protocols, folds, grasps, _seeds(args))
     with _cluster(args.dask) if args.dask else processes(args.jobs):
         made = _evaluated(systems, protocols, folds, grasps, args)

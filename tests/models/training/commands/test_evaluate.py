@@ -17,8 +17,15 @@ import pytest
 pytest.importorskip("torch", reason="needs the extra `train`")
 
 from graspd.models.training.evaluating import frame
-from tests.kit.inside import graspd
-from tests.models.training.samples import OBJECTS, table, write, write_sessions
+from tests.kit.inside import graspd, refused
+from tests.kit.tables import write_table
+from tests.models.training.samples import (
+    OBJECTS,
+    separable_counts,
+    table,
+    write,
+    write_sessions,
+)
 
 ROOT = Path(__file__).parents[4]
 
@@ -145,15 +152,24 @@ def test_wrong_input_is_one_line_and_exit_code_2(data: Path, tmp_path: Path) -> 
     assert not (tmp_path / "out").exists()
 
 
+def test_a_table_of_one_object_beside_published_ones_is_refused(data: Path, tmp_path: Path) -> None:
+    own, out = tmp_path / "own.csv", tmp_path / "out"
+    write_table(own, *separable_counts(40, 9))
+    words = "--data", data, "--own", own, "--protocol", "objects", "--seeds", "1", "--out", out
+    said = refused("evaluate", "svm-session", *words).splitlines()[-1]
+    assert "leaves out all objects of own, by whose other grasps a session model" in said
+    assert not out.exists()
+
+
 def test_an_unreachable_dask_scheduler_is_exit_code_2(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     distributed = pytest.importorskip("distributed", reason="needs the extra `cluster`")
 
-    def refused(*_: object, **__: object) -> None:
+    def no_answer(*_: object, **__: object) -> None:
         raise OSError("Timed out")  # a real client would leave a thread running
 
-    monkeypatch.setattr(distributed, "Client", refused)
+    monkeypatch.setattr(distributed, "Client", no_answer)
     options = "--data", data, "--out", tmp_path, "--dask", "tcp://127.0.0.1:9"
     done = graspd("evaluate", "svm", "--quick", *options)
     assert done.returncode == 2
