@@ -21,7 +21,7 @@ from graspd.models.judge.grasp_judge import GraspJudge
 from graspd.models.training.commands.common import WrongInputError, check_fingers, read_each, say
 from graspd.models.training.data.datasets import FEWEST_GRASPS, Grasps, concatenate
 from graspd.models.training.evaluating.days import Day
-from graspd.models.training.evaluating.metrics import interval, verdict_figures
+from graspd.models.training.evaluating.metrics import f1_interval, verdict_figures
 from graspd.models.training.fitting.trained import Trained, train
 from graspd.models.training.systems.registry import SYSTEMS, System, with_recipes
 
@@ -107,7 +107,7 @@ def _judge_of(trained: Trained) -> GraspJudge:
 def _figures(model: _Model, day: Grasps) -> dict[str, Any]:
     """Judge a table's grasps in order, from an empty session; warn of those trained on. Return
     `verdict_figures` of those not refused, the names `table` and `model`, the numbers of grasps
-    `all` and `trained_on`, and `f1_interval`, 95 %; None: no slip, judged or real."""
+    `all` and `trained_on`, and `f1_interval`, 95 %; None: of one object, or without a slip."""
     table = day.files[0].name
     try:
         day = day.of_fingers(model.fingers)
@@ -119,16 +119,13 @@ def _figures(model: _Model, day: Grasps) -> dict[str, Any]:
         say("evaluate", f"warning: {text}: it judges others worse")
     rows = _judged(model.judge(), day)
     judged = rows[~rows["refused"]]
-    slip, slipped = judged["margin"] > 0.0, judged["slipped"]
-    of = slip.astype(int) + slipped
-    f1_interval = interval(2 * (slip & slipped), of, judged["object"]) if of.any() else None
     return {
         "table": table,
         "model": model.name,
         "all": len(day),
         "trained_on": int(known.sum()),
         **verdict_figures(judged),
-        "f1_interval": f1_interval,
+        "f1_interval": f1_interval(judged),
     }
 
 
@@ -149,9 +146,11 @@ def _judged(judge: GraspJudge, day: Grasps) -> pd.DataFrame:
 def _line(figures: dict[str, Any]) -> str:
     """Return the figures of one model on one table as a line of text."""
     parts = [f"{figures['grasps']} of {figures['all']} judged"]
-    if figures["f1_interval"] is not None:
-        low, high = figures["f1_interval"]
-        others = f"{100 * low:.1f} to {100 * high:.1f} for other objects"
+    if figures["slips_called_stable"] is not None or figures["stable_called_slip"]:
+        others = "of one object"
+        if figures["f1_interval"] is not None:
+            low, high = figures["f1_interval"]
+            others = f"{100 * low:.1f} to {100 * high:.1f} for other objects"
         parts.append(f"F1 {100 * figures['f1']:.1f} % ({others})")
     if figures["slips_among_stable"] is not None:
         parts.append(f"{100 * figures['slips_among_stable']:.1f} % of `stable` slipped")

@@ -115,13 +115,6 @@ class Figures:
         """Return mean and spread of a figure of a variant."""
         return metrics.over_seeds(self.folds_of(figure, variant).to_numpy())
 
-    def f1_interval(self) -> tuple[float, float]:
-        """Return the 95 % interval of F1 over all grasps, by drawing objects with replacement."""
-        rows = self.of_variant()
-        slip, slipped = rows["margin"] > 0.0, rows["slipped"]
-        of = slip.astype(int) + slipped
-        return metrics.interval(2 * (slip & slipped), of, rows["object"])
-
     def accuracy_at(self, coverage: float) -> float:
         """Return the accuracy of the most confident verdicts, a share `coverage` of all grasps."""
         rows = self.of_variant()

@@ -159,6 +159,16 @@ def interval(some: pd.Series, of: pd.Series, objects: pd.Series) -> tuple[float,
     return float(low), float(high)
 
 
+def f1_interval(rows: pd.DataFrame) -> tuple[float, float] | None:
+    """Return the `interval` of F1, slip positive, over all rows; None: of one object, which says
+    nothing of others, or without a slip, judged or real."""
+    slip, slipped = rows["margin"] > 0.0, rows["slipped"]
+    of = slip.astype(int) + slipped
+    if not of.any() or rows["object"].nunique() < 2:
+        return None
+    return interval(2 * (slip & slipped), of, rows["object"])
+
+
 def confusion(rows: pd.DataFrame) -> Ints:
     """Return numbers of grasps, shape (2, 2): rows held, slipped; columns judged stable, slip."""
     counts: Ints = np.zeros((2, 2), np.int64)

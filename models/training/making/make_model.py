@@ -39,6 +39,7 @@ from graspd.models.training.evaluating.metrics import (
     FEWEST_JUDGED,
     confusion,
     coverage_curve,
+    f1_interval,
     verdict_figures,
 )
 from graspd.models.training.fitting.novelty import held_out_never_seen, made_up_never_seen
@@ -212,6 +213,7 @@ def _card_figures(one: Figures) -> dict[str, object]:
     """Return the figures of a protocol that a user of the model needs, slip positive.
 
     `calibrated_by`: F1 by variant of session calibration; empty if there is one variant.
+    `f1_interval`: over all grasps, for other objects; None: of one object, or without a slip.
     """
     rows = one.of_variant()
     several = one.variants if len(one.variants) > 1 else []
@@ -222,7 +224,7 @@ def _card_figures(one: Figures) -> dict[str, object]:
         "spreads": {figure: one.spread(figure) for figure in one.scores},
         "temperature": temperature(rows),
         "confusion": confusion(rows).tolist(),
-        "f1_interval": one.f1_interval(),
+        "f1_interval": f1_interval(rows),
         "palms": {table: _share(part) for table, part in rows.groupby("table")},
         "objects": {
             name: {"share": _share(part), "f1": verdict_figures(part)["f1"]}

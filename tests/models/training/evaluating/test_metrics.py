@@ -13,6 +13,7 @@ from graspd.models.training.evaluating.metrics import (
     accuracy_at,
     coverage_curve,
     cross_fitted,
+    f1_interval,
     fit_temperature,
     interval,
     over_seeds,
@@ -69,6 +70,14 @@ def test_the_interval_comes_from_drawing_objects_not_grasps() -> None:
     assert (low, high) == pytest.approx(stats.binom.ppf((0.025, 0.975), 40, 0.75) / 40, abs=0.03)
     # The same grasps ten times say nothing more.
     assert (low, high) == interval(*right_of(*[[1] * 500] * 30, *[[0] * 500] * 10))
+
+
+def test_one_object_or_no_slip_has_no_f1_interval() -> None:
+    rows = pd.DataFrame({"margin": [1.0, -1.0], "slipped": True, "object": ["cup", "pen"]})
+    # Drawn are cup twice, which is judged rightly, or pen twice, or both.
+    assert f1_interval(rows) == (0.0, 1.0)
+    assert f1_interval(rows.assign(object="cup")) is None
+    assert f1_interval(rows.assign(margin=-1.0, slipped=False)) is None
 
 
 def test_the_coverage_curve_of_six_verdicts_equals_hand_calculation() -> None:
