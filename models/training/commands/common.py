@@ -70,7 +70,6 @@ def add_shared_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--jobs",
         type=whole(1, 1024),
-        default=1,
         metavar="N",
         help="trainings at once on this machine (default: 1)",
     )
@@ -124,6 +123,8 @@ def read_grasps(command: str, args: argparse.Namespace) -> Grasps:
     """
     if args.data is None and not args.own:
         raise WrongInputError("needs --data DIR, --own FILE, or both")
+    if args.read_as and not args.own:
+        raise WrongInputError("--as is for tables of --own: there is none")
     with files_of(args.own) as own:
         grasps = read_with_lab_tables(args.data, own, args.read_as)
     if grasps.without_outcome:

@@ -12,6 +12,8 @@ from graspd.models.training.data.protocols import ABOUT, PROTOCOLS
 from graspd.models.training.evaluating.files import markdown_table
 from graspd.models.training.systems.registry import SYSTEMS
 
+OUT = Path("runs/evaluate")
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what `run` reads from the command line."""
@@ -41,9 +43,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out",
         type=Path,
-        default=Path("runs/evaluate"),
         metavar="DIR",
-        help="folder for results; what is there already is not run again (default: runs/evaluate)",
+        help=f"folder for results; what is there already is not run again (default: {OUT})",
     )
     parser.add_argument(
         "--seeds", type=whole(1, 1000), metavar="N", help="split seeds (default: 3)"
@@ -90,4 +91,7 @@ def run(args: argparse.Namespace) -> int:
     from graspd.models.training.commands.evaluation import evaluate
     from graspd.models.training.evaluating.frame import LostWorkerError
 
-    return exit_code("evaluate", args.out, lambda: evaluate(args), LostWorkerError)
+    folder: Path = args.out or OUT
+    if not args.test:
+        args.out = folder
+    return exit_code("evaluate", folder, lambda: evaluate(args), LostWorkerError)

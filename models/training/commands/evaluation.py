@@ -72,6 +72,8 @@ def evaluate(args: argparse.Namespace) -> None:
         return
     if args.table and args.data is None:
         raise WrongInputError("--table compares with the paper's figures: it needs --data")
+    if args.dask and args.jobs:
+        raise WrongInputError("--jobs is of this machine: it does not go with --dask")
     grasps = read_grasps("evaluate", args)
     check_fingers(systems, grasps)
     if args.quick:
@@ -85,7 +87,7 @@ def evaluate(args: argparse.Namespace) -> None:
     folds = QUICK_FOLDS if args.quick else FOLDS
     if args.own:
         folds = _enough_folds(systems, protocols, folds, grasps, _seeds(args))
-    with _cluster(args.dask) if args.dask else processes(args.jobs):
+    with _cluster(args.dask) if args.dask else processes(args.jobs or 1):
         made = _evaluated(systems, protocols, folds, grasps, args)
     if args.json:
         scores = pd.concat(
@@ -172,7 +174,7 @@ def _evaluated(
     }
     wanted = [job for group in groups.values() for job in group]
     if args.quick:
-        _announce(wanted, args.jobs)
+        _announce(wanted, "on the cluster" if args.dask else f"{args.jobs or 1} at once")
     found: dict[Job, pd.DataFrame] = {}
     made: dict[tuple[str, str], Figures] = {}
     with progress_bar("starting", len(wanted), hidden=args.quiet) as on_job:
@@ -187,12 +189,12 @@ def _evaluated(
     return [made[key] for key in groups]
 
 
-def _announce(wanted: Sequence[Job], at_once: int) -> None:
+def _announce(wanted: Sequence[Job], how: str) -> None:
     """Print the number of quick trainings, and their rough time by protocol and by system."""
     jobs = [(job.protocol, job.system.name, quick_seconds(job.system)) for job in wanted]
     took = pd.DataFrame(jobs, columns=["protocol", "system", "seconds"])
     total = f"about {took['seconds'].sum():.0f} s of processor time"
-    say("evaluate", f"{len(wanted)} trainings, {at_once} at once: {total}, less what is kept")
+    say("evaluate", f"{len(wanted)} trainings, {how}: {total}, less what is kept")
     for which in ("protocol", "system"):
         sums = took.groupby(which, sort=False)["seconds"].sum()
         say("evaluate", ", ".join(f"{name} {seconds:.0f} s" for name, seconds in sums.items()))
@@ -240,7 +242,7 @@ def _command(args: argparse.Namespace) -> Iterator[str]:
         yield f"--seeds {args.seeds}"
     if args.quick:
         yield "--quick"
-    if args.jobs > 1:
+    if args.jobs:
         yield f"--jobs {args.jobs}"
     if args.dask:
         yield "--dask ADDRESS"

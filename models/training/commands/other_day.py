@@ -27,7 +27,7 @@ from graspd.models.training.systems.registry import SYSTEMS, System, with_recipe
 
 DEFAULT = "small-session"
 SEED = 0
-OTHER_OPTIONS = ("data", "own", "protocol", "seeds", "table", "dask")
+OTHER_OPTIONS = ("data", "own", "protocol", "seeds", "table", "dask", "jobs", "out")
 """Options of `graspd evaluate` that do not go with `--test`."""
 
 
@@ -52,6 +52,8 @@ def judge_other_days(
     """
     if args.train and args.model:
         raise WrongInputError("--train and --model exclude each other")
+    if args.model and systems:
+        raise WrongInputError(f"{systems[0].name} goes with --train: --model is trained already")
     if not args.test or not (args.train or args.model):
         raise WrongInputError("--test needs --train or --model, and each of these needs --test")
     for option in OTHER_OPTIONS:

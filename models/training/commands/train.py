@@ -130,7 +130,7 @@ def _plan(args: argparse.Namespace, lab: tuple[str, ...]) -> TrainingPlan:
         system = dataclasses.replace(system, tables=(*published, *lab))
     files = tuple(path.name for path in args.own)
     folds = args.folds or FOLDS
-    return TrainingPlan(system, folds, args.seed, args.jobs, args.only, files, args.name)
+    return TrainingPlan(system, folds, args.seed, args.jobs or 1, args.only, files, args.name)
 
 
 def _name(text: str) -> str:

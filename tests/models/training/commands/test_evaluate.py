@@ -143,6 +143,11 @@ def test_wrong_input_is_one_line_and_exit_code_2(data: Path, tmp_path: Path) -> 
         (["svm", "--train", own, "--test", own, "--own", own], "--own does not go with"),
         (["--train", own, "--test", own, "--model", "svm"], "--train and --model exclude"),
         (["--train", own], "--test needs --train or --model, and each of these needs"),
+        (["svm", "--model", "svm", "--test", own], "svm goes with --train: --model is trained"),
+        (["--train", own, "--test", own], "--out does not go with --test"),
+        (["--train", own, "--test", own, "--jobs", "1"], "--jobs does not go with --test"),
+        (["svm", "--data", data, "--as", "table"], "--as is for tables of --own: there is none"),
+        (["svm", "--data", data, "--dask", "tcp://a:1", "--jobs", "2"], "--jobs is of this"),
     ):
         done = graspd("evaluate", "--out", tmp_path / "out", *words)
         assert done.returncode == 2
