@@ -92,18 +92,28 @@ class _Data(argparse.Action):
 
 
 def exit_code(
-    command: str, folder: Path, work: Callable[[], None], *failures: type[Exception]
+    command: str,
+    folder: Path,
+    work: Callable[[], int | None],
+    *failures: type[Exception],
+    keeps: bool = True,
 ) -> int:
     """Run `work`, which writes into `folder`; print an error in one line.
 
-    Returns 0; 1 for an exception of `failures`; 2 for wrong input, data or folder; 130 for Ctrl-C.
+    `keeps`: True if after Ctrl-C the same command continues from what is in the folder.
+
+    Returns what `work` does, None as 0; 1 for an exception of `failures`; 2 for wrong input, data
+    or folder; 130 for Ctrl-C. Raises the `OSError` of a failed write to standard output.
     """
     try:
-        work()
+        return work() or 0
     except KeyboardInterrupt:
-        say(command, "interrupted; the same command continues from here")
+        say(command, f"interrupted{'; the same command continues from here' if keeps else ''}")
         return 130
     except OSError as error:
+        raw = getattr(getattr(sys.stdout, "buffer", None), "raw", None)
+        if getattr(raw, "failure", None) is error:  # of `guarded`, which handles it
+            raise
         say(command, f"{error.filename or folder}: {error.strerror or error}")
         return 2
     except (DatasetError, TooFewGraspsError, WrongInputError) as error:
@@ -112,7 +122,6 @@ def exit_code(
     except failures as error:
         say(command, str(error))
         return 1
-    return 0
 
 
 def read_grasps(command: str, args: argparse.Namespace) -> Grasps:

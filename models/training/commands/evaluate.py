@@ -94,4 +94,5 @@ def run(args: argparse.Namespace) -> int:
     folder: Path = args.out or OUT
     if not args.test:
         args.out = folder
-    return exit_code("evaluate", folder, lambda: evaluate(args), LostWorkerError)
+    keeps = not args.test
+    return exit_code("evaluate", folder, lambda: evaluate(args), LostWorkerError, keeps=keeps)

@@ -6,8 +6,7 @@ import argparse
 import importlib
 from pathlib import Path
 
-from graspd.models.training.commands.common import WrongInputError, say
-from graspd.models.training.data.datasets import DatasetError
+from graspd.models.training.commands.common import exit_code, whole
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,12 +21,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Make the report; return its exit code, 2 for wrong input or folder. Raises `ModelError`."""
-    try:
-        code: int = importlib.import_module(REPORTS[args.report][0]).run(args)
-    except (DatasetError, OSError, WrongInputError) as error:
-        say("report", str(error))
-        return 2
-    return code
+    report = importlib.import_module(REPORTS[args.report][0])
+    folder = getattr(args, "out", Path())  # stability writes no file
+    return exit_code("report", folder, lambda: report.run(args), keeps=False)
 
 
 def _error_vs_time(parser: argparse.ArgumentParser) -> None:
@@ -70,7 +66,9 @@ def _worth(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="folder for the picture, the tables and the figures (runs/worth)",
     )
-    parser.add_argument("--seeds", type=int, default=1, metavar="N", help="of the object folds")
+    parser.add_argument(
+        "--seeds", type=whole(1, 1000), default=1, metavar="N", help="of the object folds"
+    )
     parser.add_argument(
         "--card",
         type=Path,

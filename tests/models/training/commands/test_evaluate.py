@@ -16,6 +16,8 @@ import pytest
 
 pytest.importorskip("torch", reason="needs the extra `train`")
 
+from graspd.daemon.process.streams import guarded
+from graspd.models.training.commands.common import exit_code
 from graspd.models.training.evaluating import frame
 from tests.kit.inside import graspd, refused
 from tests.kit.tables import write_table
@@ -164,6 +166,19 @@ def test_a_table_of_one_object_beside_published_ones_is_refused(data: Path, tmp_
     said = refused("evaluate", "svm-session", *words).splitlines()[-1]
     assert "leaves out all objects of own, by whose other grasps a session model" in said
     assert not out.exists()
+
+
+def test_a_full_standard_output_is_not_blamed_on_the_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def prints() -> int:
+        return sys.stdout.write("." * 10_000)
+
+    with Path("/dev/full").open("w") as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        assert guarded(lambda: exit_code("evaluate", tmp_path, prints)) == 1
+    said = capsys.readouterr().err
+    assert said == "graspd: cannot write to standard output: No space left on device\n"
 
 
 def test_an_unreachable_dask_scheduler_is_exit_code_2(
