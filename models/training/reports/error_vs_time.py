@@ -54,7 +54,10 @@ ON_PAGE = {
     **{COLUMNS[place]: place for place in (3, 4, 8, 9)},
 }
 """Titles of the table on a page, and the place of each in `COLUMNS`."""
-PAGE_TABLE = re.compile(r"^\| model, F1 in %.*\n(?:\|.*\n)+(?:\nprocessor .*\n)?", re.MULTILINE)
+PAGE_TABLE = re.compile(
+    rf"(?:^\*\*{QUICK}\*\*\n\n)*^\| model, F1 in %.*\n(?:\|.*\n)+(?:\nprocessor .*\n)?",
+    re.MULTILINE,
+)
 DEFAULT = "small-session"
 PANELS = (
     (("cv",), "known objects"),
@@ -84,21 +87,21 @@ def run(args: argparse.Namespace) -> int:
     """Measure run times; write and print the report. Raises `DatasetError`, `ModelError`, `OSError`
     or, for a page without one such table, `WrongInputError`."""
     grasps = read_all(args.data)
-    page = None if args.page is None else args.page.read_text()
-    if page is not None and len(PAGE_TABLE.findall(page)) != 1:
+    if args.page is not None and len(PAGE_TABLE.findall(args.page.read_text())) != 1:
         raise WrongInputError(f"{args.page}: has not the one table that begins `model, F1 in %`")
+    args.out.mkdir(parents=True, exist_ok=True)
     say("report", "measuring, one candidate after the other: some minutes")
     measured = report(grasps, quick=args.quick)
-    args.out.mkdir(parents=True, exist_ok=True)
     lines = table(measured)
     text = "\n".join(lines)
     base = args.out / "error-vs-time"
     base.with_suffix(".json").write_text(json.dumps(measured) + "\n")
     base.with_suffix(".md").write_text(text + "\n")
     base.with_suffix(".svg").write_text(draw(measured, lines))
-    if page is not None:
+    if args.page is not None:
         put = "\n".join(page_table(measured)) + "\n"
-        args.page.write_text(PAGE_TABLE.sub(lambda _: put, page))
+        # Read again: it may have been edited meanwhile.
+        args.page.write_text(PAGE_TABLE.sub(lambda _: put, args.page.read_text()))
         (args.page.parent / "error-vs-time.svg").write_text(draw(measured, lines))
     sys.stdout.write(f"{text}\n")
     return 0

@@ -76,6 +76,7 @@ def test_a_page_lists_whole_hand_models_the_fastest_first(
 ) -> None:
     page = (folder / "page.md").read_text()
     assert page.startswith("Above.\n\n**made with --quick")
+    assert error_vs_time.PAGE_TABLE.sub("", page) == "Above.\n\n\nBelow.\n", "with its mark"
     assert page.endswith("`graspd report error-vs-time`\n\nBelow.\n")
     told = [line.split("`")[1] for line in page.splitlines() if line.startswith("| `")]
     models = [row for row in found["rows"] if len(row["fingers"]) == 3 and row["kind"] == "model"]
