@@ -54,7 +54,7 @@ def streams(
     """Train the networks of each day and fold; yield the streams of the three tables.
 
     Objects are split `seeds` times; `folds` of each are judged. `epochs` None: the systems' own.
-    `on_day` is called with a text before the trainings of each of `DAYS`, in each fold.
+    `on_day` is called with a text after the streams of each of `DAYS`, in each fold.
     """
     systems = [SYSTEMS[name] for name in (OWN, PUBLISHED)]
     if epochs is not None:
@@ -64,7 +64,6 @@ def streams(
     for seed, fold in itertools.product(range(seeds), range(folds)):
         fold_of = object_folds(grasps.objects, DAYS_FOLDS, seed)
         for day, training, tables in DAYS:
-            on_day(f"seed {seed + 1} of {seeds}, fold {fold + 1} of {folds}, {day}")
             others = grasps.rows(np.flatnonzero(np.isin(names, training) & (fold_of != fold)))
             own, published = (train(system, others, fold_seed(seed, fold)) for system in systems)
             random = np.random.default_rng([seed, fold])
@@ -90,6 +89,7 @@ def streams(
                     }
                 )
                 yield Stream(frame, features)
+            on_day(f"seed {seed + 1} of {seeds}, fold {fold + 1} of {folds}, {day}")
 
 
 def judged(trained: Trained, grasps: Grasps, rows: Ints) -> tuple[Floats, Floats32, Bools]:

@@ -18,7 +18,7 @@ from sklearn.metrics import f1_score
 
 from graspd.models.training.commands.common import progress_bar
 from graspd.models.training.data.datasets import read_all
-from graspd.models.training.data.protocols import DAYS, DAYS_FOLDS
+from graspd.models.training.data.protocols import DAYS, DAYS_FOLDS, splits
 from graspd.models.training.evaluating.files import markdown_table, to_json, write_whole
 from graspd.models.training.evaluating.style import (
     BLUE,
@@ -78,12 +78,18 @@ Curves = dict[str, list[Figures]]
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure, draw and print. Raises `DatasetError`, `ModelError` or `OSError`."""
+    """Measure, draw and print. Raises `DatasetError`, `ModelError`, `OSError` or, for data without
+    a day or its objects, `TooFewGraspsError`."""
     grasps = read_all(args.data)
+    grasps = grasps.few() if args.quick else grasps
+    for seed in range(args.seeds):
+        splits("days", grasps, seed, DAYS_FOLDS)
+    if args.card is not None:
+        read_card(args.card)  # fail now, not after the trainings
     args.out.mkdir(parents=True, exist_ok=True)
     with progress_bar("trainings", args.seeds * DAYS_FOLDS * len(DAYS)) as on_day:
         if args.quick:
-            several = list(streams(grasps.few(), seeds=1, folds=1, epochs=1))
+            several = list(streams(grasps, seeds=1, folds=1, epochs=1))
         else:
             several = list(streams(grasps, args.seeds, on_day=on_day))
     quick = " --quick" if args.quick else ""

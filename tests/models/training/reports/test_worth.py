@@ -37,7 +37,8 @@ from graspd.models.training.reports.worth import (
 from graspd.models.training.systems.registry import System
 from graspd.models.trust.learner import SCALE
 from graspd.models.trust.risk import RiskLimits
-from tests.kit.inside import graspd
+from tests.kit.inside import graspd, refused
+from tests.models.training.samples import table, write, write_sessions
 
 GRASPS = 300
 LIMITS = limits(ALLOWED)
@@ -176,6 +177,20 @@ def test_a_scale_is_fitted_on_other_objects_of_its_split() -> None:
     assert former[0, 0] == later[0, 0]
     assert former[0, 1] != later[0, 1]
     assert former[1, 0] == later[1, 0] == SCALE
+
+
+def test_wrong_input_is_refused_before_training(tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    write_sessions(data, 80)
+    words = "report", "worth", "--data", data, "--out", tmp_path / "out"
+    assert "argument --seeds: '0' is not a whole number" in refused(*words, "--seeds", "0")
+    assert "no.json: cannot read" in refused(*words, "--card", tmp_path / "no.json")
+    for path in data.iterdir():
+        write(path, replace(table(path.stem, 80, 0), objects=("a", "b", "c", "d") * 20))
+    (data / "palm_45.csv").unlink()
+    assert refused(*words) == "graspd report: the data lack palm_45\n"
+    write(data / "palm_45.csv", replace(table("", 80, 1), objects=("a",) * 80))
+    assert "palm_45 has no grasp of the objects of fold" in refused(*words)
 
 
 @pytest.fixture(scope="module")
