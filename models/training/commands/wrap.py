@@ -8,7 +8,9 @@ import json
 import math
 import runpy
 import sys
-from collections.abc import Callable
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -116,7 +118,8 @@ def _measured(source: Path, grasps: Grasps) -> tuple[MeasuredError, onnx.ModelPr
             raise ModelError(f"{source}: cannot read: {error.strerror}") from error
         model = _with_ends(source, network, grasps)
         return _error("table", [_scores(model, grasps, np.arange(len(grasps)))]), model
-    train: Train | None = runpy.run_path(str(source)).get("train")
+    with _blaming(source):
+        train: Train | None = runpy.run_path(str(source)).get("train")
     if train is None:
         raise ModelError(f"{source}: has no function train(counts, slipped)")
     folds = min(FOLDS, len(set(grasps.objects)))
@@ -126,11 +129,35 @@ def _measured(source: Path, grasps: Grasps) -> tuple[MeasuredError, onnx.ModelPr
     scores = []
     for fold in range(folds):
         rows = np.flatnonzero(fold_of != fold)
-        network = train(grasps.counts[rows], grasps.slipped[rows])
+        network = _made(source, train, grasps.counts[rows], grasps.slipped[rows])
         model = _with_ends(source, network, grasps)
         scores.append(_scores(model, grasps, np.flatnonzero(fold_of == fold)))
-    network = train(grasps.counts, grasps.slipped)
+    network = _made(source, train, grasps.counts, grasps.slipped)
     return _error("objects", scores), _with_ends(source, network, grasps)
+
+
+def _made(
+    source: Path, train: Train, counts: NDArray[np.uint16], slipped: NDArray[np.bool_]
+) -> bytes:
+    """Return the network that the user's `train` makes. Raises `ModelError`."""
+    with _blaming(source):
+        network = train(counts, slipped)
+    if not isinstance(network, bytes):
+        kind = type(network).__name__
+        raise ModelError(f"{source}: train returns {kind}, not the bytes of an ONNX file")
+    return network
+
+
+@contextmanager
+def _blaming(source: Path) -> Iterator[None]:
+    """Make an error of the user's program a `ModelError`, which names its line."""
+    try:
+        yield
+    except Exception as error:  # it may be any
+        frames = traceback.extract_tb(error.__traceback__)
+        at = [f":{frame.lineno}" for frame in frames if frame.filename == str(source)][-1:]
+        text = f"{type(error).__name__}: {one_line(error)}"
+        raise ModelError(f"{source}{''.join(at)}: {text}") from error
 
 
 def _scores(model: onnx.ModelProto, grasps: Grasps, rows: NDArray[np.int64]) -> tuple[float, float]:

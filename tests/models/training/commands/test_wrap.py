@@ -21,6 +21,7 @@ from graspd.models import trial
 from graspd.models.contract import ModelError
 from graspd.models.runtime import TactileModel
 from tests.kit.inside import graspd as command
+from tests.kit.inside import refused
 from tests.kit.tables import write_table
 from tests.models.training.samples import separable_counts
 
@@ -186,6 +187,21 @@ OTHERS: dict[str, tuple[torch.nn.Module, tuple[int, ...], tuple[int, ...]]] = {
     "one answer without its axis": (Flat(72, 2), (1, 72), (0,)),
     "probabilities of three axes": (Deep(72, 2), (1, 72), (0,)),
 }
+
+
+PROGRAMS = {
+    "import torch\nimport absent_neighbour": ":2: ModuleNotFoundError: No module named 'absent_",
+    "def train(counts, slipped):\n    raise ValueError('mine')": ":2: ValueError: mine\n",
+    "def train(counts, slipped): ...": ": train returns NoneType, not the bytes of an ONNX file\n",
+}
+
+
+@pytest.mark.parametrize(("program", "why"), PROGRAMS.items())
+def test_a_failing_program_is_named_with_its_line(folder: Path, program: str, why: str) -> None:
+    path = folder / "failing.py"
+    path.write_text(program)
+    said = refused("models", "wrap", path, "--data", folder / "own.csv", "--out", folder / "none")
+    assert said.startswith(f"graspd: {path}{why}")
 
 
 @pytest.mark.parametrize("other", OTHERS.values(), ids=OTHERS)
