@@ -237,6 +237,8 @@ def _command(args: argparse.Namespace) -> Iterator[str]:
         yield "--data DIR"
     for path in args.own:
         yield f"--own {shlex.quote(path.name)}"
+    if args.read_as:
+        yield f"--as {args.read_as}"
     yield "--out DIR"
     if args.seeds:
         yield f"--seeds {args.seeds}"

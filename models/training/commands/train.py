@@ -130,7 +130,8 @@ def _plan(args: argparse.Namespace, lab: tuple[str, ...]) -> TrainingPlan:
         system = dataclasses.replace(system, tables=(*published, *lab))
     files = tuple(path.name for path in args.own)
     folds = args.folds or FOLDS
-    return TrainingPlan(system, folds, args.seed, args.jobs or 1, args.only, files, args.name)
+    jobs = args.jobs or 1
+    return TrainingPlan(system, folds, args.seed, jobs, args.only, files, args.name, args.read_as)
 
 
 def _name(text: str) -> str:

@@ -50,6 +50,8 @@ class TrainingPlan:
     """File names of the user's own tables that are trained on, with their endings."""
     name: str | None = None
     """Name of the model; None: made from the names of the system and of the user's own tables."""
+    read_as: str | None = None
+    """How the user's own tables are read, `--as`."""
 
     @property
     def model(self) -> str:
@@ -99,6 +101,7 @@ class TrainingPlan:
         published = any(table.name in self.system.tables for table in TABLES)
         data = ["--data DIR"] if published else []
         data += [f"--own {shlex.quote(name)}" for name in self.lab_files]
+        data += [f"--as {self.read_as}"] if self.read_as else []
         only = [] if self.only is None else [f"--only {self.only}"]
         name = [] if self.name is None else [f"--name {self.name}"]
         words = (*data, f"--seed {self.seed}", f"--folds {self.folds}", *only, *name)

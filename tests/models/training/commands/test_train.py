@@ -227,14 +227,16 @@ def test_training_with_a_name_prints_the_scenes_model_path(tmp_path: Path) -> No
     write(tmp_path / "lab.csv", smallest())
     path = tmp_path / "out" / "cups.onnx"
     options = "--own", tmp_path / "lab.csv", "--out", path.parent, "--folds", "2", "--only", "cv"
-    done = train(*options, "--name", "cups")
+    done = train(*options, "--as", "table", "--name", "cups")
     assert done.stdout.startswith(f"{path}: cv F1 ")
     assert done.stderr.splitlines()[-1] == (
         f'graspd train: for a scene, below [model]: path = "{path}"'
     )
     assert TactileModel(path).contract.name == "cups"
     command = json.loads(path.with_suffix(".json").read_text())["command"]
-    assert command.endswith("--only cv --name cups")
+    assert command == (
+        f"graspd train {SYSTEM} --own lab.csv --as table --seed 0 --folds 2 --only cv --name cups"
+    )
 
 
 def test_a_system_of_fingers_that_a_table_lacks_is_refused(tmp_path: Path) -> None:
