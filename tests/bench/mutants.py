@@ -247,10 +247,10 @@ def _forked(task: Callable[[], int], limit_s: float | None, log: Path) -> int | 
     descriptor = os.pidfd_open(pid)
     try:
         ended, _, _ = select.select([descriptor], [], [], limit_s)
+    finally:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(pid, signal.SIGKILL)  # and whatever a test has started
         _, status = os.waitpid(pid, 0)
-    finally:
         os.close(descriptor)
     return os.waitstatus_to_exitcode(status) if ended else None
 

@@ -126,7 +126,7 @@ def judge(found: Found) -> list[Row]:
         Row("missing of a fifth of the plan's", max(FEW * found.planned - heard.readings, 0), 0),
         Row("ended before it was told to", found.ended_early, 0),
         Row("outages", found.outages),
-        *_resources(found.samples),
+        *(_resources(found.samples) if found.samples else ()),
         Row("gaps in seq", heard.gaps, 0),
         Row("restarts", max(len(heard.boots) - 1, 0) + (not heard.boots), 0),
         Row("exit code", abs(found.exit_code), 0),
