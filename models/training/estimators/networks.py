@@ -122,13 +122,13 @@ def reproducible(seed: int, threads: int = THREADS) -> Iterator[None]:
 def train_network(
     config: NetworkConfig,
     inputs: Floats32,
-    slipped: Bools | Floats,
+    slipped: Bools,
     recipe: AnyRecipe,
     *,
     seed: int,
 ) -> nn.Sequential:
-    """Train a network on inputs (N, *shape) and labels (N,), 1 for a slip; return it in evaluation
-    mode.
+    """Train a network on inputs (N, *shape) and labels (N,), True for a slip; return it in
+    evaluation mode.
 
     The same arguments give the same weights on the same machine. Each epoch sees each
     grasp at most once, shuffled; a short last batch may be left out. Raises `ValueError` for fewer
