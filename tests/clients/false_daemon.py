@@ -47,6 +47,7 @@ def false_daemon(
 ) -> Iterator[list[bytes]]:
     """Publish verdicts of `outcome`, with fields `more`, during the block, and answer `lift`.
 
+    A field may be a function of what was received so far.
     `messages_each` in `more`: messages on each grasp, else all are on one. `answer` None: with what
     was published. Frames `taken` answer an outcome and `not-lifting`. Without frames no answer is
     sent. `endpoint`: where to publish; None: at `out` in `folder`. Yields the list of what was
@@ -80,7 +81,10 @@ def _serve(
         seq = 0
         while not stop.is_set():
             grasp = 1 + seq // more.get("messages_each", 10**6)
-            fields = {"grasp": grasp, "silence_ms": PATIENT_MS, **more}
+            said = {
+                name: value(heard) if callable(value) else value for name, value in more.items()
+            }
+            fields = {"grasp": grasp, "silence_ms": PATIENT_MS, **said}
             message = verdict(seq, time.monotonic_ns(), outcome, **fields)
             out.send_multipart([TOPIC, json.dumps(message).encode()])
             seq += 1

@@ -22,11 +22,19 @@ UNSAID: dict[str, Any] = {"verdict": "unknown", "verdict_code": 0, "valid": Fals
 """Fields that make a `stable` message unknown."""
 WATCHES, STILL = {"supervised": True}, {"still_ms": 240.0}
 """Arguments of `lift`: supervision by a person, stillness."""
+RESTARTS = {"boot_id": lambda heard: "b" if heard else "a"}
+"""The daemon is restarted at the first question."""
 NO_RISK = {"target": 0.05, "lifts": 1, "slips": 0}
 Fields = dict[str, Any]
 Case = tuple[Fields, Answer | None, Fields, str]
 """Changes to a published `stable`, the daemon's answer (None: not asked), arguments of `lift`, and
 the decision expected, or `supervised`."""
+
+
+def restarted(lost: Answer) -> Answer:
+    """Answer right from start `b` on, and `lost` before."""
+    return lambda published: (lost if published["boot_id"] == "a" else told())(published)
+
 
 ANSWERS: dict[str, Case] = {
     "the same": ({}, told(), {}, "stable"),
@@ -36,6 +44,8 @@ ANSWERS: dict[str, Case] = {
     "of another grasp": ({}, told(grasp=2), {}, "unknown"),
     "of another start": ({}, told(boot_id="b"), {}, "unknown"),
     "to come": ({}, told(seq=10**6), {}, "unknown"),
+    "to come, then a restart": (RESTARTS, restarted(told(seq=10**6)), {}, "stable"),
+    "lost in a restart": (RESTARTS, restarted(lambda _: []), {}, "stable"),
     "without sense": ({}, told(p_slip=None), {}, "unknown"),
     "not JSON": ({}, lambda _: [b"stable"], {}, "unknown"),
     "empty": ({}, lambda _: [b""], {}, "unknown"),

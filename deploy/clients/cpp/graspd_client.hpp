@@ -857,7 +857,9 @@ public:
     }
 
     // Returns the newest verdict if it confirms the answer, else an unknown one; asks if needed. An
-    // answered `slip` is returned at once. Without an ask endpoint `newest` decides alone.
+    // answered `slip` is returned at once. Without an ask endpoint `newest` decides alone. A restart
+    // of the daemon loses questions and voids answers, so another start is asked again; nothing is
+    // asked before its first message.
     Verdict decided(Verdict newest) {
         newest = if_still(std::move(newest));
         if (!asks_) return newest;
@@ -880,11 +882,17 @@ public:
             }
             answer_.reset();
         }
-        if (!asked_ && !answer_) {
+        if (newest.seq && asked_of_ != newest.boot_id) {
+            asked_ = false;
+            answer_.reset();
+            may_be_announced_ = true;
+        }
+        if (!asked_ && !answer_ && newest.seq) {
             if (may_be_announced_) link_.take_back(link_.asking);
             may_be_announced_ = false;
             link_.ask(link_.asking, "lift");
             asked_ = true;
+            asked_of_ = newest.boot_id;
         }
         if (newest.decision == Decision::unknown && !permits(newest)) return newest;
         return refused(std::move(newest));
@@ -927,6 +935,7 @@ private:
     bool asks_, supervised_, asked_ = false, heard_ = false;
     bool may_be_announced_ = false, lifts_ = false;
     std::optional<double> still_ms_;
+    std::optional<std::string> asked_of_;  // start of the daemon that was asked last
     std::optional<Verdict> answer_;   // answer to be confirmed
     std::optional<Verdict> refusal_;  // last answer, if it permits no lift
 };

@@ -963,6 +963,8 @@ class _Question:
         self._newest, self._asking, self._supervised = newest, asking, supervised
         self._still_ms = still_ms
         self._asked = self._heard = self._may_be_announced = False
+        self._asked_of: str | None = None
+        """Start of the daemon that was asked last; None: nothing was asked."""
         self._answer: Verdict | None = None
         """Answer that the newest message must confirm; None: no answer yet."""
         self._refusal: Verdict | None = None
@@ -979,7 +981,9 @@ class _Question:
     def decided(self, newest: Verdict) -> Verdict:
         """Return the newest verdict if it confirms the answer, else an unknown; ask if needed.
 
-        An answered `slip` is returned at once. Without an ask endpoint `newest` decides alone.
+        An answered `slip` is returned at once. Without an ask endpoint `newest` decides alone. A
+        restart of the daemon loses questions and voids answers, so another start is asked again;
+        nothing is asked before its first message.
         """
         newest = self._if_still(newest)
         if self._asking is None:
@@ -1003,11 +1007,13 @@ class _Question:
             if same and self.permits(newest):
                 return replace(newest, owner=self._answer.owner)
             self._answer = None
-        if not self._asked and self._answer is None:
+        if newest.boot_id not in (None, self._asked_of):
+            self._asked, self._answer, self._may_be_announced = False, None, True
+        if not self._asked and self._answer is None and newest.boot_id is not None:
             if self._may_be_announced:
                 self._asking.hang_up(lifts=False)
             self._asking.ask(b"lift")
-            self._asked, self._may_be_announced = True, False
+            self._asked, self._may_be_announced, self._asked_of = True, False, newest.boot_id
         if newest.decision == Decision.UNKNOWN and not self.permits(newest):
             return newest
         return self._refused(newest)
