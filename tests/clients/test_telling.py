@@ -85,12 +85,16 @@ def test_a_grasp_with_an_outcome_is_not_offered_again(connect: Connect, tmp_path
 
 
 def test_a_grasp_reported_as_not_lifted_is_offered_again(connect: Connect, tmp_path: Path) -> None:
-    with false_daemon(tmp_path) as heard:
+    grasp = [1]
+    with false_daemon(tmp_path, grasp=lambda _: grasp[0]) as heard:
         graspd = connect(tmp_path)
         assert graspd.tell(graspd.lift(LONG_S).grasp, "not-lifted") == ""
         assert heard[-1].endswith(b" 1 not-lifted")
         assert graspd.lift(LONG_S).may
         assert graspd.unreported == 0
+        grasp[0] = 2
+        wait_until(lambda: graspd.lift(LONG_S).grasp.number == 2)
+        assert graspd.unreported == 1, "the second lift of the first grasp"
 
 
 def test_an_outcome_that_graspd_cannot_keep_stays_unreported(

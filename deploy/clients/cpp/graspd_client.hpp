@@ -1126,9 +1126,12 @@ private:
     // Note that the hand may lift this grasp. The outcome of the lift before is now overdue.
     void allow(const Key& lift) {
         last_ = lift;
-        if (std::none_of(lifts_.begin(), lifts_.end(),
-                         [&](const auto& each) { return each.first == lift; }))
+        const auto known = std::find_if(lifts_.begin(), lifts_.end(),
+                                        [&](const auto& each) { return each.first == lift; });
+        if (known == lifts_.end())
             lifts_.emplace_back(lift, false);
+        else
+            known->second = false;  // it was told as not lifted before
         if (lifts_.size() > LIFTS_MAX) {
             forgotten_ += !lifts_.front().second;
             lifts_.pop_front();

@@ -489,7 +489,7 @@ class _Hand:
         lift before is now overdue."""
         self._last = lift
         if lift[1]:
-            self._lifts.setdefault(lift, False)
+            self._lifts[lift] = False  # also if it was told as not lifted before
         if len(self._lifts) > LIFTS_MAX:
             self._forgotten += not self._lifts.pop(next(iter(self._lifts)))
         if self.unreported >= self._warn_at:
