@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -23,6 +24,8 @@ from tests.kit.waiting import wait_until
 
 PYTHON = ROOT / "deploy" / "clients" / "python"
 LIFTED_ON = Grasp("0f0e0d0c0b0a09080706050403020100", 42)
+ANSWERED_S = 0.5
+"""Longest time until an answer of the stand-in arrives, s."""
 ANSWERS: dict[str, tuple[list[bytes], str]] = {
     "taken": ([TAKEN], ""),
     "with a later field": ([b'{"v":1,"ok":true,"later":[1]}'], ""),
@@ -95,6 +98,23 @@ def test_a_grasp_reported_as_not_lifted_is_offered_again(connect: Connect, tmp_p
         grasp[0] = 2
         wait_until(lambda: graspd.lift(LONG_S).grasp.number == 2)
         assert graspd.unreported == 1, "the second lift of the first grasp"
+
+
+def test_an_answer_that_came_after_tell_counts_at_the_next_tell(
+    connect: Connect, tmp_path: Path
+) -> None:
+    grasp = [1]
+    with false_daemon(tmp_path, grasp=lambda _: grasp[0]) as heard:
+        graspd = connect(tmp_path)
+        first = graspd.lift(LONG_S).grasp
+        grasp[0] = 2
+        wait_until(lambda: (second := graspd.lift(LONG_S)).may and second.grasp != first)
+        graspd.tell(first, "slip", wait_s=0.0)
+        wait_until(lambda: b" 1 slip" in heard[-1])
+        time.sleep(ANSWERED_S)
+        assert graspd.tell(first._replace(number=2), "slip") == ""
+        graspd.lift(DEADLINE_S)
+        assert graspd.unreported == 0
 
 
 def test_an_outcome_that_graspd_cannot_keep_stays_unreported(

@@ -1082,6 +1082,7 @@ public:
         if (!asks_) throw std::invalid_argument("an outcome needs an ask_endpoint");
         const Nanoseconds due_ns = detail::now_ns() + duration_ns(wait_s);
         if (!is_here()) return OutcomeAnswer{"other-process"};
+        hear();
         link_->telling.hang_up();
         link_->ask(link_->telling, telling);
         told_.reset();

@@ -431,6 +431,7 @@ class _Hand:
         due_ns = _due_ns("wait_s", wait_s)
         if self._closed:
             return OutcomeAnswer("closed")
+        self._hear()
         self._link.telling.hang_up()
         self._link.telling.ask(telling)
         self._told, self._telling = OutcomeAnswer("no-answer"), _key(lifted_on)
