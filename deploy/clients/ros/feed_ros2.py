@@ -23,16 +23,16 @@ SENDER.bind(("", PORT + 1))  # fixed, as counts from another port are of other s
 def _send_counts(message: BiotacAll) -> None:
     counts = {each: list(message.tactiles[ORDER.index(each)].electrodes) for each in FINGERS}
     stamp = message.header.stamp
-    fields = {"t": stamp.sec + stamp.nanosec * 1e-9, "hand": HAND, "counts": counts}
+    fields = {"t": stamp.sec + stamp.nanosec * 1e-9 or None, "hand": HAND, "counts": counts}
     SENDER.sendto(json.dumps(fields).encode(), (TO, PORT))
 
 
 def _send_joints(message: JointState) -> None:
     angles = {message.name[place]: angle for place, angle in enumerate(message.position)}
     mine = {name: angle for name, angle in angles.items() if name.startswith(SIDE)}
-    fields = {"t": message.header.stamp.sec + message.header.stamp.nanosec * 1e-9, "joints": mine}
+    time_s = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9 or None
     if mine:  # an arm may publish on the same topic
-        SENDER.sendto(json.dumps(fields).encode(), (TO, PORT - 1))
+        SENDER.sendto(json.dumps({"t": time_s, "joints": mine}).encode(), (TO, PORT - 1))
 
 
 NODE.create_subscription(BiotacAll, f"/{SIDE}/tactile", _send_counts, qos_profile_sensor_data)
