@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from graspd.biotac import electrode_columns
@@ -20,6 +20,9 @@ from graspd.drivers.recordings.csv_rows import Row, read_rows
 from graspd.drivers.recordings.kinds import BAGS, TABLES, Kind, files_of, kind_of, refuse_options
 from graspd.drivers.recordings.layout import ReadAs, layout_of
 from graspd.extras import require
+
+with suppress(ModuleNotFoundError):  # without pandas each call says what to install
+    import pandas as pd
 
 if TYPE_CHECKING:
     from graspd.daemon.record.export import Export
@@ -33,8 +36,10 @@ def read_grasps(path: str | os.PathLike[str], *, read_as: ReadAs | None = None) 
     `path`: a grasp table, or a recording (MCAP); `-` is standard input. Pass `read_as="table"`
     for a table in which many rows repeat each other. A missing or damaged count is NaN. Grasps
     without an outcome are left out with a warning; of a recording also those after damage, judged
-    with repaired electrodes, or with the counts of another grasp. Raises `RecordingError`.
+    with repaired electrodes, or with the counts of another grasp. Raises `RecordingError`,
+    and `ModuleNotFoundError` without pandas.
     """
+    require("pandas", "graspd.read_grasps", "pandas")
     with files_of([Path(path)]) as (file,):
         return _grasps(file, read_as)
 
@@ -79,8 +84,10 @@ def read_recording(
 
     `path`: a stream, a recording (MCAP) or a ROS bag; `-` is standard input. A missing or
     damaged count is NaN. Each row has the newest angles. A stream without times needs
-    `read_as="stream"` and `rate_hz`. Raises `RecordingError`.
+    `read_as="stream"` and `rate_hz`. Raises `RecordingError`, and `ModuleNotFoundError` without
+    pandas.
     """
+    require("pandas", "graspd.read_recording", "pandas")
     with files_of([Path(path)]) as (file,):
         return _readings(file, read_as, rate_hz)
 

@@ -48,7 +48,5 @@ def __getattr__(name: str) -> object:
     if name == "client":
         return import_module("graspd.client")
     if name in _MODULES:
-        if name in ("read_grasps", "read_recording"):
-            import_module("graspd.extras").require("pandas", f"graspd.{name}", "pandas")
         return getattr(import_module(_MODULES[name]), name)
     raise AttributeError(f"module 'graspd' has no attribute '{name}'")
