@@ -135,7 +135,7 @@ int main() {
         } else {
             try {
                 call(client, order, words);
-            } catch (const std::invalid_argument& error) {
+            } catch (const std::exception& error) {
                 std::cout << "refused " << error.what() << std::endl;
             }
         }

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import zmq
 
 from tests.clients.either import Connect
 from tests.clients.false_daemon import Answer, false_daemon, of, told
@@ -173,6 +174,13 @@ def test_a_negative_or_not_finite_still_ms_is_refused(
 ) -> None:
     with pytest.raises(ValueError, match="still_ms"):
         connect(tmp_path).lift(DEADLINE_S, still_ms=still_ms)
+
+
+def test_a_wrong_ask_endpoint_is_refused_before_the_first_call(
+    connect: Connect, tmp_path: Path
+) -> None:
+    with pytest.raises((ValueError, zmq.ZMQError), match="name too long"):
+        connect(tmp_path, "x" * 200).grasp(0.0)
 
 
 @pytest.mark.parametrize(

@@ -30,12 +30,13 @@ class Call:
     answered: list[bytes] = field(default_factory=list)
     due: tuple[int, bytes] | None = None
 
-    def ask(self, question: bytes) -> None:
+    def ask(self, question: bytes) -> bool:
         assert self.due is None, "one question at a time"
         self.said.append(question)
         if self.answers:
             delay_ns, payload = self.answers.pop(0)
             self.due = self.world.now_ns + delay_ns, payload
+        return True
 
     def answer(self) -> bytes | None:
         if self.due is None or self.due[0] > self.world.now_ns:

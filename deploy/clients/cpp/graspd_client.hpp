@@ -729,7 +729,10 @@ struct Call {
 class Link {
 public:
     explicit Link(const Options& options)
-        : options_(options), socket_(connected(zmq::socket_type::sub, options.endpoint)) {}
+        : options_(options), socket_(connected(zmq::socket_type::sub, options.endpoint)) {
+        if (!options.ask_endpoint.empty())  // at once, to refuse a wrong endpoint
+            asking.socket = connected(zmq::socket_type::dealer, options.ask_endpoint);
+    }
 
     bool receive(std::vector<zmq::message_t>& frames) { return received(socket_, frames); }
 
@@ -741,11 +744,14 @@ public:
         zmq_poll(items.data(), static_cast<int>(items.size()), static_cast<long>(timeout_ms));
     }
 
-    void ask(Call& call, const std::string& question) {
+    // Send a question; returns false if it is lost, as the peer has turned this client away.
+    bool ask(Call& call, const std::string& question) {
         if (!call.socket)
             call.socket = connected(zmq::socket_type::dealer, options_.ask_endpoint);
-        uninterrupted(
+        const auto sent = uninterrupted(
             [&] { return call.socket.send(zmq::buffer(question), zmq::send_flags::dontwait); });
+        if (!sent) call.hang_up();  // libzmq makes no other connection
+        return sent.has_value();
     }
 
     // Report that no lift follows the question. Its socket stays open, so that this is sent; beyond
@@ -885,13 +891,12 @@ public:
         if (newest.seq && asked_of_ != newest.boot_id) {
             asked_ = false;
             answer_.reset();
-            may_be_announced_ = true;
+            may_be_announced_ = asked_of_.has_value();
         }
         if (!asked_ && !answer_ && newest.seq) {
             if (may_be_announced_) link_.take_back(link_.asking);
             may_be_announced_ = false;
-            link_.ask(link_.asking, "lift");
-            asked_ = true;
+            asked_ = link_.ask(link_.asking, "lift");
             asked_of_ = newest.boot_id;
         }
         if (newest.decision == Decision::unknown && !permits(newest)) return newest;
@@ -945,8 +950,8 @@ private:
 // Subscribes to the verdicts of one hand. Use it in one thread.
 class Client {
 public:
-    // Throws `zmq::error_t` for a wrong endpoint (a wrong `ask_endpoint` throws only at the first
-    // question), `std::invalid_argument` for an invalid age or probability.
+    // Throws `zmq::error_t` for a wrong endpoint, `std::invalid_argument` for an invalid age or
+    // probability.
     explicit Client(const Options& options)
         : newest_("verdict." + options.hand, age_ns(options.max_age_ms),
                   options.same_computer.value_or(detail::is_same_computer(options.endpoint)),

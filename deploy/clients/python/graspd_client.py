@@ -293,9 +293,8 @@ class _Hand:
         reports. `same_computer`: True if the daemon's monotonic clock is also the client's. None:
         True for `ipc://` and loopback addresses, so pass False for a tunnel. `max_p_slip`: a
         `stable` with this `p_slip` or more counts as unknown; pass the scene's `slip_threshold` if
-        it is above 0.5. `keys`: None for no encryption. Raises `zmq.ZMQError` for a wrong endpoint
-        (a wrong `ask_endpoint` raises only at the first question), `TypeError` for one that is not
-        text, and `ValueError` for an invalid age or probability.
+        it is above 0.5. `keys`: None for no encryption. Raises `zmq.ZMQError` for a wrong endpoint,
+        `TypeError` for one that is not text, and `ValueError` for an invalid age or probability.
         """
         for name, text in (("endpoint", endpoint), ("hand", hand), ("ask_endpoint", ask_endpoint)):
             if not isinstance(text, str) and (name, text) != ("ask_endpoint", None):
@@ -1009,12 +1008,13 @@ class _Question:
                 return replace(newest, owner=self._answer.owner)
             self._answer = None
         if newest.boot_id not in (None, self._asked_of):
-            self._asked, self._answer, self._may_be_announced = False, None, True
+            self._asked, self._answer = False, None
+            self._may_be_announced = self._asked_of is not None
         if not self._asked and self._answer is None and newest.boot_id is not None:
             if self._may_be_announced:
                 self._asking.hang_up(lifts=False)
-            self._asking.ask(b"lift")
-            self._asked, self._may_be_announced, self._asked_of = True, False, newest.boot_id
+            self._asked, self._may_be_announced = self._asking.ask(b"lift"), False
+            self._asked_of = newest.boot_id
         if newest.decision == Decision.UNKNOWN and not self.permits(newest):
             return newest
         return self._refused(newest)
@@ -1068,6 +1068,8 @@ class _Link:
         self.asking, self.telling, self.timing = (_Call(self, ask or "") for _ in range(3))
         try:
             self._socket = self.connected(zmq.SUB, endpoint)
+            if ask is not None:  # at once, to refuse a wrong endpoint
+                self.asking.socket = self.connected(zmq.DEALER, ask)
         except BaseException:
             self._context.destroy(0)
             raise
@@ -1138,14 +1140,16 @@ class _Call:
         self._link, self._endpoint = link, endpoint
         self.socket: zmq.Socket[bytes] | None = None
 
-    def ask(self, question: bytes) -> None:
-        """Send a question, which is lost if the peer has turned this client away."""
+    def ask(self, question: bytes) -> bool:
+        """Send a question; False: it is lost, as the peer has turned this client away."""
         if self.socket is None:
             self.socket = self._link.connected(zmq.DEALER, self._endpoint)
         try:
             self.socket.send(question, zmq.NOBLOCK)
         except zmq.Again:  # a refused handshake ends the connection, and libzmq makes no other
             self.hang_up()
+            return False
+        return True
 
     def answer(self) -> bytes | None:
         """Return the answer; None if none has come yet, b"" if it is not a single frame."""
