@@ -202,7 +202,18 @@ def test_the_cpp_client_forgets_messages_after_the_computer_slept(
 
 
 @pytest.mark.parametrize(
-    "words", [[], ["ipc:///x"], ["ipc:///x", "-1"], ["nowhere", "1"], ["--watch"]]
+    "words",
+    [
+        [],
+        ["ipc:///x"],
+        ["ipc:///x", "-1"],
+        ["ipc:///x", "0,5"],
+        ["--still", "240ms", "ipc:///x", "1"],
+        ["ipc:///x", "1", "ipc:///y", "a mug"],
+        ["--tell", "ipc:///x", "ipc:///y", "a", "1.5", "held"],
+        ["nowhere", "1"],
+        ["--watch"],
+    ],
 )
 def test_lift_gate_exits_with_2_on_a_wrong_command_line(lift_gate: Path, words: list[str]) -> None:
     result = ran(lift_gate, *words)

@@ -453,6 +453,18 @@ inline std::pair<std::optional<Message>, std::string> read(std::string_view payl
     }
 }
 
+// Throws `std::invalid_argument` for a text that is no name of an object; an empty one is allowed.
+inline void check_object(const std::string& name) {
+    const auto fits = [&name](const char& c) {
+        const bool plain = (c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z') ||
+                           (c >= '0' && c <= '9') || c == '_';
+        return plain || (&c != name.data() && (c == '-' || c == '.'));
+    };
+    if (name.size() > OBJECT_MAX || !std::all_of(name.begin(), name.end(), fits))
+        throw std::invalid_argument("no name of an object: 1 to 64 ASCII letters, digits, _, -, ., "
+                                    "the first no - and no .: " + name);
+}
+
 // Returns the message that reports an outcome. Throws `std::invalid_argument` without a grasp, or
 // for a wrong name.
 inline std::string telling(const Verdict& lifted_on, Outcome how, const std::string& object_name) {
@@ -462,16 +474,8 @@ inline std::string telling(const Verdict& lifted_on, Outcome how, const std::str
                       (how == Outcome::held      ? " stable"
                        : how == Outcome::slipped ? " slip"
                                                  : " not-lifted");
-    if (object_name.empty()) return told;
-    const auto fits = [&object_name](const char& c) {
-        const bool plain = (c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z') ||
-                           (c >= '0' && c <= '9') || c == '_';
-        return plain || (&c != object_name.data() && (c == '-' || c == '.'));
-    };
-    if (object_name.size() > OBJECT_MAX || !std::all_of(object_name.begin(), object_name.end(), fits))
-        throw std::invalid_argument("no name of an object: 1 to 64 ASCII letters, digits, _, -, ., the "
-                                    "first no - and no .: " + object_name);
-    return told + ' ' + object_name;
+    check_object(object_name);
+    return object_name.empty() ? told : told + ' ' + object_name;
 }
 
 // Returns the answer to an outcome; none if it is not understood.

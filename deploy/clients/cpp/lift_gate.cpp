@@ -17,8 +17,19 @@
 #include "graspd_client.hpp"
 
 #include <iostream>
+#include <sstream>
 
 namespace {
+
+// Returns the number that a word is; throws `std::invalid_argument` if it is anything else.
+template <typename Number>
+Number number(const std::string& word) {
+    std::istringstream text(word);
+    Number found{};
+    if (!(text >> found) || text.peek() != std::char_traits<char>::eof())
+        throw std::invalid_argument(word + " is not a number, such as 1 or 0.5");
+    return found;
+}
 
 void print(const graspd::Verdict& verdict, const graspd::Counts& counts) {
     std::cout << graspd::name(verdict.decision) << " [";
@@ -63,6 +74,7 @@ graspd::Outcome typed() {
 
 int ask(const graspd::Options& options, double deadline_s, bool supervised,
         std::optional<double> still_ms, const std::optional<std::string>& object) {
+    if (object) graspd::detail::check_object(*object);  // before a lift that could not be told
     graspd::Client client(options);
     const graspd::LiftAnswer answer = client.may_i_lift(deadline_s, supervised, still_ms);
     print(answer.verdict, client.counts());
@@ -79,7 +91,7 @@ int tell(const std::vector<std::string>& words) {
     options.ask_endpoint = words[2];
     graspd::Verdict lifted_on;
     lifted_on.boot_id = words[3];
-    lifted_on.grasp = std::stoll(words[4]);
+    lifted_on.grasp = number<std::int64_t>(words[4]);
     graspd::Client client(options);
     return show(client.tell(lifted_on, outcome(words[5]), words.size() == 7 ? words[6] : ""));
 }
@@ -94,7 +106,7 @@ int main(int count, char** given) {
     try {
         std::optional<double> still_ms;
         if (words.size() > 1 && words[0] == "--still") {
-            still_ms = std::stod(words[1]);
+            still_ms = number<double>(words[1]);
             words.erase(words.begin(), words.begin() + 2);
         }
         if (!words.empty() && words[0] == "--watch" && (words.size() == 2 || words.size() == 4)) {
@@ -109,7 +121,7 @@ int main(int count, char** given) {
             if (words.size() > 2) options.ask_endpoint = words[2];
             std::optional<std::string> object;
             if (words.size() == 4) object = words[3];
-            return ask(options, std::stod(words[1]), supervised, still_ms, object);
+            return ask(options, number<double>(words[1]), supervised, still_ms, object);
         }
     } catch (const std::exception& error) {
         std::cerr << "lift_gate: " << error.what() << '\n';
