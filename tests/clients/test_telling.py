@@ -10,12 +10,13 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from deploy.clients.python.graspd_client import Client, Decision, Outcome, Verdict
 from tests.clients.either import Connect, Grasp
-from tests.clients.false_daemon import TAKEN, false_daemon
+from tests.clients.false_daemon import TAKEN, false_daemon, of, told
 from tests.clients.messages import TEACHES, verdict
 from tests.clients.test_both import DEADLINE_S, LONG_S
 from tests.conftest import ROOT
@@ -165,7 +166,12 @@ def test_the_example_controller_reports_a_supervised_unknown_grasp(tmp_path: Pat
     code = (PYTHON / "try_outcomes.py").read_text()
     for place, name in (("/tmp/graspd-loop.ask.ipc", "ask"), ("/tmp/graspd-loop.ipc", "out")):
         code = code.replace(f"ipc://{place}", f"ipc://{tmp_path}/{name}")
-    with false_daemon(tmp_path, outcome="unknown", messages_each=100, **TEACHES) as heard:
+    refusals = iter([of("slip")])
+
+    def answer(published: dict[str, Any]) -> list[bytes]:
+        return next(refusals, told())(published)
+
+    with false_daemon(tmp_path, answer, "unknown", messages_each=100, **TEACHES) as heard:
         controller = subprocess.run(
             [sys.executable, "-c", code],
             env={**os.environ, "PYTHONPATH": str(PYTHON)},
@@ -176,6 +182,8 @@ def test_the_example_controller_reports_a_supervised_unknown_grasp(tmp_path: Pat
             check=False,
         )
     assert (controller.returncode, controller.stderr) == (0, "")
-    assert re.search(r"^grasp \d+: unknown, p_slip not known Risk\(", controller.stdout)
-    told = [each.split()[3:] for each in heard if each.startswith(b"outcome ")]
-    assert told == [[b"stable", b"mug"], [b"not-lifted", b"mug"]]
+    refused, lifted = controller.stdout.splitlines()[:2]
+    assert refused == "do not lift: slip"
+    assert re.match(r"grasp \d+: unknown, p_slip not known Risk\(", lifted)
+    outcomes = [each.split()[3:] for each in heard if each.startswith(b"outcome ")]
+    assert outcomes == [[b"stable", b"mug"], [b"not-lifted", b"mug"]]

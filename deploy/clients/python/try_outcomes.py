@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import sys
+import time
 
 from graspd_client import Client, Outcome
 
@@ -35,9 +36,13 @@ def main() -> None:
     with Client(VERDICTS, ask_endpoint=QUESTIONS) as client:
         while True:
             answer = client.may_i_lift(10.0, supervised=True)
-            if not answer:
-                continue
             verdict = answer.verdict
+            if not answer:
+                why = " ".join([verdict.decision, *verdict.reasons])
+                sys.stdout.write(f"do not lift: {why}\n")
+                sys.stdout.flush()
+                time.sleep(1.0)  # the same grasp would be refused again
+                continue
             p_slip = "not known" if verdict.p_slip is None else f"{verdict.p_slip:.2f}"
             said = f"{verdict.decision}, p_slip {p_slip} {verdict.risk}"
             sys.stdout.write(f"grasp {verdict.grasp}: {said}\n")
