@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
+import os
 import shutil
 import signal
 import subprocess
 import tempfile
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -19,6 +21,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 CPP = ROOT / "deploy" / "clients" / "cpp"
 KEPT = Path.home() / ".cache" / "graspd-tests"
+KEEP_S = 7 * 24 * 3600.0
 Words = Sequence[str | Path]
 HEADERS = {"zmq_addon.hpp": "cppzmq-dev", "nlohmann/json.hpp": "nlohmann-json3-dev"}
 """Headers that the client includes, and the Debian packages that have them."""
@@ -55,8 +58,8 @@ def kept(command: Callable[[Path], Words], name: str) -> Path:
     """Return the program `name`; if not cached, run the command `command(folder)`, which makes it
     in `folder`.
 
-    The cache is valid while sources and compiler stay the same. One process makes the program, in
-    four seconds, while others wait.
+    The cache is valid while sources and compiler stay the same; programs of others that were used
+    last a week ago are removed. One process makes the program, in four seconds, while others wait.
     """
     sources = [
         *CPP.glob("*.?pp"),
@@ -70,6 +73,10 @@ def kept(command: Callable[[Path], Words], name: str) -> Path:
         digest.update(source.read_bytes())
     program = KEPT / digest.hexdigest()[:16] / name
     program.parent.mkdir(parents=True, exist_ok=True)
+    os.utime(program.parent)
+    for former in KEPT.iterdir():
+        if former.stat().st_mtime < time.time() - KEEP_S:
+            shutil.rmtree(former, ignore_errors=True)
     with (program.parent / f"{name}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not program.exists():
