@@ -49,7 +49,7 @@ class MachineError(Exception):
     """The emulated machine did not boot, run a command or answer in time; the message says what."""
 
 
-class ProtocolError(Exception):
+class ProtocolError(MachineError):
     """The other side refused a request, answered too late, or has gone."""
 
 
