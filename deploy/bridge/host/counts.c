@@ -14,7 +14,8 @@ bool counts_open(struct counts *counts, const char *path, unsigned sensors)
         return true;
     }
     counts->file = strcmp(path, "-") == 0 ? stdin : fopen(path, "r");
-    counts->rewindable = counts->file != NULL && fseek(counts->file, 0, SEEK_SET) == 0;
+    counts->rewindable = counts->file != NULL && counts->file != stdin &&
+                         fseek(counts->file, 0, SEEK_SET) == 0;
     return counts->file != NULL;
 }
 

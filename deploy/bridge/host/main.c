@@ -48,6 +48,7 @@ struct options {
 };
 
 static const char *link_path; /* to be removed at the end */
+static unsigned sensors_named; /* by options: the largest number, plus one */
 
 static void remove_link(void)
 {
@@ -88,16 +89,43 @@ static unsigned long number(const char *option, const char **text, int base, uns
 
     errno = 0;
     value = strtoul(*text, &after, base);
-    if (after == *text || **text == '-' || errno != 0 || value < least || value > most) {
+    if (after == *text || **text == '-' || errno != 0 || value < least || value > most ||
+        strchr(":,", *after) == NULL) {
         fail(EXIT_USAGE, "%s: %s is not a number in %lu..%lu", option, *text, least, most);
     }
     *text = *after == ':' || *after == ',' ? after + 1 : after;
     return value;
 }
 
+/* Parse the number at `text`, which nothing follows. */
+static unsigned long last_number(const char *option, const char *text, int base,
+                                 unsigned long least, unsigned long most)
+{
+    unsigned long value = number(option, &text, base, least, most);
+
+    if (*text != '\0') {
+        fail(EXIT_USAGE, "%s: %s is too much", option, text);
+    }
+    return value;
+}
+
+/* Copy a text to a field of `size` bytes, which NULs fill. One that is too long ends the program. */
+static void take_text(const char *option, const char *text, char *field, size_t size)
+{
+    if (strlen(text) > size) {
+        fail(EXIT_USAGE, "%s: %s is longer than %lu characters", option, text, (unsigned long)size);
+    }
+    memset(field, 0, size);
+    memcpy(field, text, strlen(text));
+}
+
+/* Parse the sensor's number at *text, as `number` does. */
 static struct sim_sensor *sensor_of(const char *option, const char **text)
 {
-    return &host_port.sensor[number(option, text, 10, 0, PROTOCOL_SENSORS_MAX - 1)];
+    unsigned sensor = (unsigned)number(option, text, 10, 0, PROTOCOL_SENSORS_MAX - 1);
+
+    sensors_named = sensor >= sensors_named ? sensor + 1 : sensors_named;
+    return &host_port.sensor[sensor];
 }
 
 static void take_sequence(struct bridge_config *config, const char *text)
@@ -128,7 +156,7 @@ static void take_outage(struct options *options, const char *text)
     }
     outage->sensor = (unsigned)(sensor_of("--unplug", &text) - host_port.sensor);
     outage->from = *text != '\0' ? number("--unplug", &text, 10, 0, UINT32_MAX) : 0;
-    outage->until = *text != '\0' ? number("--unplug", &text, 10, 0, UINT32_MAX) : UINT32_MAX;
+    outage->until = *text != '\0' ? last_number("--unplug", text, 10, 0, UINT32_MAX) : UINT32_MAX;
 }
 
 /* Take an option about one sensor; false if `option` is another. */
@@ -143,20 +171,19 @@ static bool take_sensor_option(const char *option, const char *value)
     }
     sensor = sensor_of(option, &value);
     if (strcmp(option, "--serial") == 0) {
-        memset(sensor->serial, 0, sizeof sensor->serial);
-        memcpy(sensor->serial, value, strnlen(value, sizeof sensor->serial));
+        take_text(option, value, sensor->serial, sizeof sensor->serial);
         return true;
     }
     if (strcmp(option, "--settle-us") == 0) {
-        sensor->settle_ns = 1000u * (uint64_t)number(option, &value, 10, 0, 1000000);
+        sensor->settle_ns = 1000u * (uint64_t)last_number(option, value, 10, 0, 1000000);
         return true;
     }
-    electrode = number(option, &value, 10, 1, SIM_ELECTRODES) - 1;
     if (strcmp(option, "--dead") == 0) {
-        sensor->dead |= UINT32_C(1) << electrode;
+        sensor->dead |= UINT32_C(1) << (last_number(option, value, 10, 1, SIM_ELECTRODES) - 1);
     } else {
+        electrode = number(option, &value, 10, 1, SIM_ELECTRODES) - 1;
         sensor->forced |= UINT32_C(1) << electrode;
-        sensor->forced_word[electrode] = (uint16_t)number(option, &value, 16, 0, 0xFFFF);
+        sensor->forced_word[electrode] = (uint16_t)last_number(option, value, 16, 0, 0xFFFF);
     }
     return true;
 }
@@ -164,21 +191,20 @@ static bool take_sensor_option(const char *option, const char *value)
 static void take_option(struct options *options, const char *option, const char *value)
 {
     if (strcmp(option, "--sensors") == 0) {
-        options->config.sensors = (uint8_t)number(option, &value, 10, 1, PROTOCOL_SENSORS_MAX);
+        options->config.sensors = (uint8_t)last_number(option, value, 10, 1, PROTOCOL_SENSORS_MAX);
     } else if (strcmp(option, "--sequence") == 0) {
         take_sequence(&options->config, value);
     } else if (strcmp(option, "--period-us") == 0) {
         options->config.period_us =
-            (uint32_t)number(option, &value, 10, BRIDGE_PERIOD_MIN_US, 10000000);
+            (uint32_t)last_number(option, value, 10, BRIDGE_PERIOD_MIN_US, 10000000);
     } else if (strcmp(option, "--spi-hz") == 0) {
-        host_port.spi_hz = (uint32_t)number(option, &value, 10, 500000, 10000000);
+        host_port.spi_hz = (uint32_t)last_number(option, value, 10, 500000, 10000000);
     } else if (strcmp(option, "--counts") == 0) {
         options->counts = value;
     } else if (strcmp(option, "--unplug") == 0) {
         take_outage(options, value);
     } else if (strcmp(option, "--board") == 0) {
-        memset(host_port.board, 0, sizeof host_port.board);
-        memcpy(host_port.board, value, strnlen(value, sizeof host_port.board));
+        take_text(option, value, host_port.board, sizeof host_port.board);
     } else if (strcmp(option, "--link") == 0) {
         options->link = value;
     } else if (!take_sensor_option(option, value)) {
@@ -210,6 +236,9 @@ static void take_options(struct options *options, int count, char **argument)
         take_option(options, argument[i], argument[i + 1]);
     }
     host_port.sensors = options->config.sensors;
+    if (sensors_named > host_port.sensors) {
+        fail(EXIT_USAGE, "there is no sensor %u: --sensors %u", sensors_named - 1, host_port.sensors);
+    }
 }
 
 /* ---- counts of the sensors ------------------------------------------------------------------- */

@@ -63,6 +63,12 @@ def bridge_probe(bridge_folder: Path) -> Path:
     return build_program(bridge_folder, "probe", "test/probe.c", *core)
 
 
+@pytest.fixture(scope="module")
+def bridge_program(bridge_folder: Path) -> Path:
+    """The bridge as a program of this computer."""
+    return build_program(bridge_folder, "graspd-bridge", "src/*.c", "host/*.c")
+
+
 def test_the_firmware_passes_its_own_tests(bridge_folder: Path) -> None:
     sources = ("test/test_bridge.c", "host/sim_sensor.c", "src/*.c")
     done = ran(build_program(bridge_folder, "test_bridge", *sources))
@@ -170,11 +176,46 @@ def test_sound_frames_are_found_among_100000_damaged_and_errors_counted(
     assert errors > 50_000
 
 
-def test_the_driver_reads_the_firmware_running_on_a_pc(bridge_folder: Path, tmp_path: Path) -> None:
-    program = build_program(bridge_folder, "graspd-bridge", "src/*.c", "host/*.c")
+@pytest.mark.parametrize(
+    "words",
+    [
+        "--sensors 2.5",
+        "--period-us 20000ms",
+        "--dead 0:3,4",
+        "--answer 0:3:A52DH",
+        "--unplug 4 --sensors 3",
+        "--serial 0:BTSP-longer-than-sixteen",
+    ],
+)
+def test_the_bridge_refuses_an_option_that_means_nothing(bridge_program: Path, words: str) -> None:
+    assert ran(bridge_program, *words.split()).returncode == 2
+
+
+def test_counts_of_a_file_on_standard_input_end_the_bridge(
+    bridge_program: Path, tmp_path: Path
+) -> None:
+    link, rows = tmp_path / "port", tmp_path / "rows"
+    rows.write_text((" ".join(["1000"] * 72) + "\n") * 5)
+    with (
+        rows.open() as file,
+        subprocess.Popen(
+            [bridge_program, "--link", link, "--counts", "-"], stdin=file, stdout=subprocess.DEVNULL
+        ) as bridge,
+    ):
+        try:
+            wait_until(link.exists)
+            with SpiBridgeDriver(str(link), ("ff", "mf", "th")) as driver:
+                wait_until(lambda: (driver.read_ready(), bridge.poll())[1] is not None)
+        finally:
+            bridge.terminate()
+
+
+def test_the_driver_reads_the_firmware_running_on_a_pc(
+    bridge_program: Path, tmp_path: Path
+) -> None:
     link = tmp_path / "port"
     readings: list[TactileReading] = []
-    with subprocess.Popen([program, "--link", link], stdout=subprocess.DEVNULL) as bridge:
+    with subprocess.Popen([bridge_program, "--link", link], stdout=subprocess.DEVNULL) as bridge:
         try:
             wait_until(link.exists)
             with SpiBridgeDriver(str(link), ("ff", "mf", "th")) as driver:
