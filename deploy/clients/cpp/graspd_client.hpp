@@ -453,7 +453,7 @@ inline std::pair<std::optional<Message>, std::string> read(std::string_view payl
     }
 }
 
-// Throws `std::invalid_argument` for a text that is no name of an object; an empty one is allowed.
+// Throws `std::invalid_argument` for a text that is not an object's name; an empty one is allowed.
 inline void check_object(const std::string& name) {
     const auto fits = [&name](const char& c) {
         const bool plain = (c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z') ||

@@ -442,7 +442,7 @@ class _Hand:
         return self._told
 
     def close(self) -> None:
-        """Close the sockets. May be called again; every verdict is unknown from then on.
+        """Close the sockets, in up to 0.2 s. May be called again; every verdict is then unknown.
 
         A running call in another task ends at once and closes them, one in another thread at its
         next message, or without one after up to 10 s.
@@ -753,7 +753,7 @@ class AsyncClient(_Hand):
             self._woken.set_result(None)
 
     def close(self) -> None:
-        """As `Client.close`; a waiting task is woken."""
+        """As `Client.close`; a waiting task is woken. May block the loop for up to 0.2 s."""
         super().close()
         self._wake()
 
