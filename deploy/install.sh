@@ -97,12 +97,14 @@ check_arguments() {
     # These go into shebangs, the unit and sed.
     case $prefix in
         *[!A-Za-z0-9/._-]*) wrong "--prefix: only letters, digits and / . _ -" ;;
-        '' | /[!/]*[!/]) ;;
+        '' | /[!/] | /[!/]*[!/]) ;;
         *) wrong "--prefix must be a folder such as /opt/graspd, without a slash at its end" ;;
     esac
     case $extras in *[!A-Za-z0-9,_-]*) wrong "--extras: names with commas between" ;; esac
     case $enable in *[!a-z0-9_-]*) wrong "--enable: the name of a scene, of a-z 0-9 _ -" ;; esac
     [ -z "$purge" ] || [ -n "$uninstall" ] || wrong "--purge goes with --uninstall"
+    [ -z "$uninstall" ] || [ -z "$wheelhouse$extras$python$can$rebuild" ] ||
+        wrong "--uninstall goes with --purge, --prefix and --root alone"
     [ -z "$enable" ] || [ -z "$root$uninstall" ] || wrong "--enable: not with --root or --uninstall"
 }
 
@@ -298,8 +300,8 @@ environment() {
     printf '%s\n' "$digest" >"$new/inputs.sha256"
     printf '%s\n' "$extras" >"$new/extras"
     ln -sfn "${new##*/}" "$root$prefix/venv.new"
+    new='' # an interruption during the next line must not remove what it makes current
     mv -T "$root$prefix/venv.new" "$current"
-    new=''
     case $former in
         '') did "$prefix/venv is new: $version" ;;
         "$version") did "$prefix/venv is new: $version again, rebuilt" ;;

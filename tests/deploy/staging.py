@@ -38,8 +38,9 @@ def wheelhouse(folder: Path, version: str, *, starts: bool = True) -> Path:
 
 
 def installer(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    """Run install.sh with `arguments`, and with this Python for its virtual environment."""
-    return ran(INSTALLER, "--python", sys.executable, *arguments)
+    """Run install.sh with `arguments`, and to install with this Python."""
+    python = [] if "--uninstall" in arguments else ["--python", sys.executable]
+    return ran(INSTALLER, *python, *arguments)
 
 
 def install(root: Path, wheels: Path, *arguments: str) -> str:

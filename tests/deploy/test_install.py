@@ -159,6 +159,20 @@ def test_a_failed_upgrade_leaves_the_former_version_unchanged(
     assert version_below(staged) == "graspd 0.1.0"
 
 
+def test_an_upgrade_killed_at_the_exchange_leaves_a_graspd_that_starts(
+    staged: Path, tmp_path: Path
+) -> None:
+    newer = wheelhouse(tmp_path / "second", "0.2.0")
+    exchange = tmp_path / "bin/mv"
+    exchange.parent.mkdir()
+    exchange.write_text('#!/bin/sh\n/bin/mv "$@"\nkill -TERM $PPID\n')
+    exchange.chmod(0o755)
+    path = f"PATH={exchange.parent}:{os.environ['PATH']}"
+    words = ["--python", sys.executable, "--root", staged, "--wheelhouse", newer]
+    assert ran("env", path, INSTALLER, *words).returncode == 143
+    assert version_below(staged) == "graspd 0.2.0"
+
+
 def test_several_wheels_of_graspd_are_refused(staged: Path, tmp_path: Path) -> None:
     wheels, before = wheelhouse(tmp_path / "both", "0.2.0"), content(staged)
     older = next(wheelhouse(tmp_path / "older", "0.1.0").iterdir())
@@ -200,7 +214,7 @@ def test_another_prefix_is_named_everywhere_and_remembered(wheels: Path, tmp_pat
     assert "/opt/graspd" not in unit
     assert version_below(root, "/srv/hand") == "graspd 0.1.0"
     assert install(root, wheels) == "graspd: nothing to change in /srv/hand\n"
-    elsewhere = installer("--root", root, "--wheelhouse", wheels, "--prefix", "/opt/graspd")
+    elsewhere = installer("--root", root, "--wheelhouse", wheels, "--prefix", "/a")
     assert elsewhere.returncode == 1
     assert "uninstall that first" in elsewhere.stderr
     assert installer("--root", root, "--uninstall").returncode == 0
@@ -356,6 +370,8 @@ def test_a_python_that_is_too_old_is_refused(tmp_path: Path, wheels: Path) -> No
         ["--enable", "right", "--root", "staged"],
         ["--enable", "Right; reboot"],
         ["--extras", "a b"],
+        ["--uninstall", "--rebuild"],
+        ["--uninstall", "--extras", "record"],
     ],
     ids=" ".join,
 )
