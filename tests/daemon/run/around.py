@@ -267,6 +267,10 @@ class Door:
         taken, self.questions = self.questions[:8], self.questions[8:]
         return taken
 
+    @property
+    def is_asked(self) -> bool:
+        return bool(self.questions)
+
     def flood(self) -> None:
         """Send questions of many connections, and messages that are not questions."""
         for number in range(300 * self.is_open):
