@@ -21,6 +21,7 @@ from graspd.daemon.assembly.plan import Plan, recorded_kind
 from graspd.daemon.commands.arguments import add_reading
 from graspd.daemon.judge.pipeline import Judgement, Pipeline
 from graspd.daemon.judge.reasons import Reason
+from graspd.daemon.process.files import require_linux
 from graspd.daemon.process.text import complain, printable, write_json, write_lines
 from graspd.daemon.run.replaying import trained_on
 from graspd.daemon.run.unjudged import Unjudged
@@ -89,6 +90,7 @@ def run(args: argparse.Namespace) -> int:
     if args.action == "settle":
         _settle(wanted, model, list(dict.fromkeys(args.lifts)), args.told)
     elif args.action == "reset":
+        require_linux("to keep a session")
         folder = SessionFolder(wanted.session_path)
         with folder if os.path.isdir(folder.path) else contextlib.nullcontext():  # locking makes it
             result = "forgotten" if folder.remove() else "no session was kept"

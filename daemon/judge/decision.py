@@ -19,6 +19,8 @@ WITHHELD: Final = {
     Permission.RISK_EXCEEDED: Reason.RISK_EXCEEDED,
 }
 """Reason against calling a grasp `stable`, by what the risk permits; None: no reason."""
+JOINTS_LATE_NS: Final = 150_000_000
+"""Age of joint angles above which a grasp cannot settle, ns."""
 
 
 # Without slots, so that a default can be read from the class.

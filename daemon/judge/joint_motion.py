@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from graspd.daemon.judge.decision import JOINTS_LATE_NS
 from graspd.daemon.judge.reasons import Reason
 from graspd.drivers.base import JointReading
 
@@ -14,8 +15,6 @@ One count of a Hall sensor is 0.0006 rad, so noise alone shows up to 0.02 rad/s.
 """
 WINDOW_NS = 80_000_000
 """Shortest time between two angles from which a speed is computed, ns."""
-LATE_NS = 150_000_000
-"""Age of the angles above which the grasp cannot settle, ns."""
 LOST_NS = 1_000_000_000
 """Age of the angles above which their stream is lost, ns: judging continues without it."""
 FROZEN_NS = 1_000_000_000
@@ -62,7 +61,7 @@ class JointMotion:
             self.latest_ns.clear()
         past = self.past.setdefault(name, [])
         before = past[-1][1] if past else None
-        if not 0 <= t_ns - self.latest_ns.get(name, t_ns) <= LATE_NS:
+        if not 0 <= t_ns - self.latest_ns.get(name, t_ns) <= JOINTS_LATE_NS:
             past.clear()  # time went back, or the joint may have moved in a gap
         self.latest_ns[name] = t_ns
         if not past or t_ns - past[-1][0] >= WINDOW_NS // ANGLES:
@@ -80,7 +79,7 @@ class JointMotion:
             if self._waits_since_ns is None or self._waits_since_ns > t_ns:
                 self._waits_since_ns = t_ns
             return None if self.is_lost(t_ns) else Reason.JOINTS_LATE
-        if any(t_ns - at_ns > LATE_NS for at_ns in self.latest_ns.values()):
+        if any(t_ns - at_ns > JOINTS_LATE_NS for at_ns in self.latest_ns.values()):
             return Reason.JOINTS_LATE
         if not all(map(self._is_still, self.past.values())):
             return Reason.MOVING
@@ -108,9 +107,9 @@ class JointMotion:
         )
 
     def _drop_lost(self, t_ns: int) -> None:
-        """Forget joints last read over `LOST_NS` before `t_ns`, or over `LATE_NS` after it."""
+        """Forget joints read over `LOST_NS` before `t_ns`, or over `JOINTS_LATE_NS` after it."""
         for name, latest_ns in list(self.latest_ns.items()):
-            if -LATE_NS <= t_ns - latest_ns <= LOST_NS:
+            if -JOINTS_LATE_NS <= t_ns - latest_ns <= LOST_NS:
                 continue
             del self.past[name], self.latest_ns[name]
             self._waits_since_ns = min(latest_ns, t_ns)

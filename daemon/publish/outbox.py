@@ -14,7 +14,7 @@ import onnxruntime
 
 from graspd.biotac import Finger
 from graspd.daemon import version
-from graspd.daemon.judge.joint_motion import LATE_NS
+from graspd.daemon.judge.decision import JOINTS_LATE_NS
 from graspd.daemon.judge.pipeline import Judgement, Pipeline
 from graspd.daemon.judge.reasons import Decision, GateChange, Moment, Reason
 from graspd.daemon.publish.messages import (
@@ -253,7 +253,7 @@ class Outbox:
             joints={
                 name: angle_rad
                 for name, (made_ns, angle_rad) in joints.items()
-                if abs(reading.made_ns - made_ns) <= LATE_NS
+                if abs(reading.made_ns - made_ns) <= JOINTS_LATE_NS
             },
         )
         payload = encode(message)

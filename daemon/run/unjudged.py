@@ -83,7 +83,7 @@ class Unjudged(Companion):
         if moment.touching is not None:
             self._touched.update(moment.touching)
             self._fingers = tuple(moment.fingers or ())
-        self._unreadable.update(UNREADABLE.intersection(judgement.reasons))
+        self._unreadable.update(each for each in judgement.reasons if each in UNREADABLE)
         self._was_tared |= {Reason.NOT_TARED, *UNREADABLE}.isdisjoint(judgement.reasons)
         if moment.grasp != self._grasp:
             self._end_grasp()
