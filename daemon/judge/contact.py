@@ -18,14 +18,8 @@ from graspd.biotac import COUNT_MAX, ELECTRODES
 
 WINDOW = 100
 """Untouched sweeps whose median is a baseline: one second at 100 Hz."""
-SHORT_REST = 50
-"""Untouched sweeps whose median a baseline follows if a touch comes before `WINDOW` of them.
-
-Else the baseline of a hand that rests for less than a second each time would stay behind: after
-half a minute of warm-up drift its tare is forgotten, and the next hold counts as rest.
-"""
-READ_MIN = 0.6
-"""Smallest share of a window's sweeps in which an electrode with a baseline was usable.
+READ_MIN = 60
+"""Fewest of the sweeps of a window in which an electrode with a baseline was usable, of `WINDOW`.
 
 Nearly all electrodes have as many on a link that loses 5 % of single samples. An electrode that is
 broken for longer has no baseline.
@@ -208,20 +202,21 @@ class Window:
         self.usable[place] = True if usable is None else usable
         self.number += 1
 
-    def rests(self, fingers: Sequence[int], sweeps: int = WINDOW) -> Iterator[Rest | None]:
-        """Yield the tare of each of `fingers` (rows) by the last `sweeps`, at most `WINDOW`.
+    def rests(self, fingers: Sequence[int]) -> Iterator[Rest | None]:
+        """Yield the tare of each of `fingers` (rows); None: it moved, or few electrodes are sound.
 
-        None: it moved, or few electrodes are sound. Call it after at least `WINDOW` sweeps.
+        Call it after at least `WINDOW` sweeps.
         """
-        places = np.arange(self.number - sweeps, self.number) % WINDOW
+        oldest = self.number % WINDOW
+        sweeps = np.concatenate((self.counts[oldest:], self.counts[:oldest]))
         # Counts that are contiguous by electrode and 32 bits wide sort in a quarter of the time.
-        window = np.ascontiguousarray(self.counts[places].transpose(1, 2, 0), dtype=np.int32)
-        halves = _median(window[..., sweeps // 2 :]) - _median(window[..., : sweeps // 2])
+        window = np.ascontiguousarray(sweeps.transpose(1, 2, 0), dtype=np.int32)
+        halves = _median(window[..., WINDOW // 2 :]) - _median(window[..., : WINDOW // 2])
         baseline = _median(window)
         # A median may end in .5: doubled, all values are whole numbers.
         twice = np.abs(2 * window - (2.0 * baseline).astype(np.int32)[..., np.newaxis])
         sigmas = MAD_TO_SIGMA * (_median(twice) / 2.0)
-        usable = np.count_nonzero(self.usable[places], axis=0) >= READ_MIN * sweeps
+        usable = np.count_nonzero(self.usable, axis=0) >= READ_MIN
         sound = (baseline > 0) & (baseline < COUNT_MAX) & (sigmas <= 3.0 * SIGMA_MAX_COUNTS)
         sound &= usable
         for finger in fingers:
@@ -296,26 +291,17 @@ class Contact:
                 touch.alone_since_ns = None
             elif self.tared[finger] and touch.has_lost_rest(t_ns, middles[finger]):
                 self._forget(finger)
-        self._follow_rest(t_ns)
-
-    def _follow_rest(self, t_ns: int) -> None:
-        """Tare the fingers that have not been touched for long enough."""
-        due: list[int] = []
-        short: list[int] = []
+        due = []
         for finger, touch in enumerate(self.touches):
             touch.untouched += 1
             if self.tared[finger] and touch.fall >= SUSPECT * touch.threshold:
-                # It may be the beginning of a touch.
-                if SHORT_REST < touch.untouched <= WINDOW:
-                    short.append(finger)
-                touch.untouched = 0
+                touch.untouched = 0  # it may be the beginning of a touch
             elif touch.untouched >= WINDOW and touch.untouched % TARE_EVERY == 0:
                 due.append(finger)
-        for fingers, sweeps in ((due, WINDOW), (short, SHORT_REST)):
-            if fingers:
-                for finger, rest in zip(fingers, self.window.rests(fingers, sweeps), strict=True):
-                    if rest is not None:
-                        self._settle(finger, rest, t_ns)
+        if due:
+            for finger, rest in zip(due, self.window.rests(due), strict=True):
+                if rest is not None:
+                    self._settle(finger, rest, t_ns)
 
     def _falls(
         self, median: NDArray[np.uint16], usable: NDArray[np.bool_] | None

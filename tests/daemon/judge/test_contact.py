@@ -145,12 +145,12 @@ def rested(fingers: int = 1, required: list[int] | None = None) -> tuple[Contact
 
 def test_a_tare_comes_after_100_untouched_sweeps_then_every_25() -> None:
     contact, looks = Contact(1), []
-    for place in range(1, 420):
-        counts = pressed(REST, {120: 9, 160: 10, 211: 10, 261: 10}.get(place, 0))
+    for place in range(1, 320):
+        counts = pressed(REST, {120: 9, 160: 10}.get(place, 0))  # 10 is half of a touch
         contact.observe(place * PERIOD_NS, counts, counts, None)
         if contact.touches[0].tared_ns == place * PERIOD_NS:
             looks.append(place)
-    assert looks == [100, 125, 150, 211, 361, 386, 411], "a touch may begin at 10 counts"
+    assert looks == [100, 125, 150, 260, 285, 310], "a hundred sweeps after what looked as a touch"
 
 
 @pytest.mark.parametrize(("required", "again"), [(None, True), ([1], True), ([0], False)])
@@ -380,14 +380,6 @@ def test_a_hand_that_opens_after_a_long_hold_touches_nothing(held_s: int, drift:
     assert not hand.play(felt(0.0, held_s, held_s + 4.0, drift))[10:].any()
     assert all(hand.contact.tared)
     assert hand.play(felt(300.0, held_s, held_s + 2.0, drift))[10:].all()
-
-
-def test_rests_of_half_a_second_are_enough_to_follow_drift() -> None:
-    hand = Hand()
-    hand.play(felt(0.0, -1.5, 0.0, 0.7))
-    for begin_s in range(0, 60, 4):
-        assert hand.play(felt(300.0, begin_s, begin_s + 3.4, 0.7))[10:].all()
-        assert not hand.play(felt(0.0, begin_s + 3.4, begin_s + 4.0, 0.7))[10:].any()
 
 
 @pytest.mark.parametrize("lost", [0.01, 0.02, 0.05])
