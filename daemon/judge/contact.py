@@ -7,7 +7,7 @@ electrodes alike.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -61,7 +61,7 @@ Electrodes of one finger drift apart by 0.2 counts/s (measured on three sensors)
 the drift is more than half of `TOUCH_COUNTS`.
 """
 ALONE_NS = 30_000_000_000
-"""Longest touch while a required finger does not touch, ns; after it the tare is forgotten."""
+"""Longest touch while another finger does not touch, ns; after it the tare is forgotten."""
 SUSPECT = 0.5
 """A sweep with a fall above this share of a touch's threshold is not used for the tare."""
 SIGMA_MIN_COUNTS = 1.5
@@ -105,7 +105,7 @@ class Touch:
     since_ns: int | None = None
     """Time at which the touch began. None: the finger does not touch."""
     alone_since_ns: int | None = None
-    """Time since which this finger has touched while a required one did not. None: not so."""
+    """Time since which this finger has touched while another did not. None: not the case."""
     held_long: bool = False
     """True at the sweep in which a long hold ends."""
     untouched: int = 0
@@ -150,11 +150,11 @@ class Touch:
         self.lowest = min(self.lowest, max(self.fall, 0.0))
 
     def has_lost_rest(self, t_ns: int, middle: float) -> bool:
-        """Return True if the finger must be tared again. Do not call it while it holds something.
+        """Return True if the finger must be tared again. Call it while not all fingers touch.
 
         Reasons for a new tare: a long hold has ended, the whole finger rests above its baseline, or
-        it has touched for over `ALONE_NS` while a required finger did not. `middle`: fall of its
-        median electrode, counts.
+        it has touched for over `ALONE_NS` while not all fingers do. `middle`: fall of its median
+        electrode, counts.
         """
         if not self.touching:
             # A finger that rests higher was tared while it touched, or has drifted far.
@@ -233,10 +233,8 @@ class Window:
 class Contact:
     """Tares all fingers while they rest, and finds which touch. Constant memory, no clock."""
 
-    def __init__(self, fingers: int, required: Iterable[int] | None = None) -> None:
-        """`fingers`: their number. `required`: rows of those that must touch to hold something;
-        None: all. No finger has a baseline yet."""
-        self._required = frozenset(range(fingers) if required is None else required)
+    def __init__(self, fingers: int) -> None:
+        """`fingers`: their number. No finger has a baseline yet."""
         shape = (fingers, ELECTRODES)
         self.touches = [Touch() for _ in range(fingers)]
         self.touching = [False] * fingers
@@ -273,7 +271,7 @@ class Contact:
         elapsed_s, self._last_ns = (t_ns - last_ns) / 1e9, t_ns
         self.window.add(counts, usable)
         middles = [0.0] * len(numbers)
-        holds = True
+        all_touch = True
         for finger, touch in enumerate(self.touches):
             number = numbers[finger]
             if self.tared[finger] and number >= SOUND_MIN:
@@ -285,9 +283,9 @@ class Contact:
                 self.tared[finger] = False
                 touch.end()
             self.touching[finger] = touch.touching
-            holds &= touch.touching or finger not in self._required
+            all_touch &= touch.touching
         for finger, touch in enumerate(self.touches):
-            if holds and touch.touching:
+            if all_touch:
                 touch.alone_since_ns = None
             elif self.tared[finger] and touch.has_lost_rest(t_ns, middles[finger]):
                 self._forget(finger)

@@ -151,6 +151,7 @@ class HandTracker:
         """`fingers`: the rows of a reading."""
         self._fingers = tuple(fingers)
         self._fresh = FreshMedian((len(fingers), ELECTRODES))
+        self._contact = Contact(len(fingers))
         self._joints: JointMotion | None = None
         if limits.joints:
             from graspd.daemon.judge.joint_motion import JointMotion  # only where it is needed
@@ -159,7 +160,6 @@ class HandTracker:
         self.on_request = limits.on_request
         self.motion = Motion(len(fingers), limits.gate.false_alarms, early=limits.gate.early)
         self.gate = Gate(fingers, limits, self.motion)
-        self._contact = Contact(len(fingers), map(self._fingers.index, self.gate.required))
         self._words = [FingerWord() for _ in fingers]
         self._last_ns: int | None = None
         """Time of the last usable reading."""
