@@ -473,7 +473,7 @@ remove() {
     each_file drop
     drop backoff.conf "$units/graspd@.service.d/backoff.conf"
     drop network "$network_file"
-    for each in "$root$prefix/venv" "$root$prefix"/venv-*; do
+    for each in "$root$prefix/venv" "$root$prefix/venv.new" "$root$prefix"/venv-*; do
         if [ -L "$each" ] || [ -d "$each" ]; then
             rm -rf -- "$each"
             did "removed ${each#"$root"}"

@@ -107,7 +107,8 @@ def _is_one(device: Device, other: Device) -> bool:
     if device.kind is DeviceKind.UDP:
         ends = Endpoint.parse(device.name), Endpoint.parse(other.name)
         return ends[0].port > 0 and clash(*map(str, ends))
-    if device.part and other.part and device.part != other.part:
+    shares = device.kind is not DeviceKind.SERIAL  # a port has one owner
+    if shares and device.part and other.part and device.part != other.part:
         return False
     return os.path.realpath(device.name) == os.path.realpath(other.name)
 

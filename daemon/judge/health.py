@@ -129,7 +129,7 @@ class Health:
             sound = reading.faults == 0
             faults = int(np.bitwise_or.reduce(reading.faults, axis=None))
             railed = self._compare(np.where(sound, counts, self._previous)) & sound
-            self._changed[~sound] = self._number
+            self._changed[~sound] += 1  # neither ends nor lengthens a run of equal counts
         broken = railed | self._worn_out()
         if sound is not None:
             broken |= ~sound

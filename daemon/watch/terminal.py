@@ -105,7 +105,8 @@ class Keyboard:
                 if b"\t" in typed:
                     self.tabs, self.spaces = self.tabs + typed.count(b"\t"), 0
                 self.spaces += typed.count(b" ")
-                return not typed or b"q" in typed.lower()
+                # F2 sends ESC O Q.
+                return not typed or (b"q" in typed.lower() and b"\x1b" not in typed)
         return False
 
     @contextlib.contextmanager

@@ -94,7 +94,8 @@ class SerialLog(LinkLogDriver[Record]):
         event, data = record
         conversation = self.stream
         if event is LineEvent.OPENED or conversation.link.state is LinkState.CLOSED:
-            conversation.link.start(t_ns)
+            if conversation.link.state is not LinkState.WAITING:  # else a retry
+                conversation.link.start(t_ns)
             conversation.opened(t_ns)
         if event is LineEvent.SENT:
             conversation.sent(data, t_ns)

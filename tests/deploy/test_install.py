@@ -200,6 +200,7 @@ def test_an_uninstall_leaves_the_scenes_and_what_was_learned(staged: Path) -> No
 
 def test_a_purge_leaves_nothing(staged: Path, wheels: Path) -> None:
     install(staged, wheels, "--can")
+    (staged / "opt/graspd/venv.new").symlink_to("venv-0")  # as an interrupted exchange leaves it
     done = installer("--root", staged, "--uninstall", "--purge")
     assert done.returncode == 0, done.stderr
     assert content(staged) == {}

@@ -79,8 +79,8 @@ static void fail(int code, const char *format, ...)
 
 /* ---- options --------------------------------------------------------------------------------- */
 
-/* Parse the number at *text, and move *text behind it and one separator (: or ,). A wrong one ends
- * the program. */
+/* Parse the number at *text, and move *text behind it and one separator (: or ,). A wrong one, or
+ * other text behind it, ends the program. */
 static unsigned long number(const char *option, const char **text, int base, unsigned long least,
                             unsigned long most)
 {
@@ -101,12 +101,12 @@ static unsigned long number(const char *option, const char **text, int base, uns
 static unsigned long last_number(const char *option, const char *text, int base,
                                  unsigned long least, unsigned long most)
 {
-    unsigned long value = number(option, &text, base, least, most);
+    const char *rest = strpbrk(text, ":,");
 
-    if (*text != '\0') {
-        fail(EXIT_USAGE, "%s: %s is too much", option, text);
+    if (rest != NULL) {
+        fail(EXIT_USAGE, "%s: %s is too much", option, rest);
     }
-    return value;
+    return number(option, &text, base, least, most);
 }
 
 /* Copy a text to a field of `size` bytes, which NULs fill. One that is too long ends the program. */

@@ -119,6 +119,17 @@ def test_samples_that_were_not_read_do_not_jump() -> None:
         assert broken_of(checked).sum() == broken_of(checked)[1, 4] == place % 2
 
 
+def test_lost_samples_do_not_hide_an_electrode_that_is_dead() -> None:
+    health = Health(len(FINGERS))
+    for place in range(40):
+        reading = flat(2000 + place)
+        reading.counts[1, 4] = 2000
+        if place % 10 == 5:
+            reading.counts[1, 4], reading.faults[1, 4] = 0, ElectrodeFault.MISSING
+        checked = health.check(reading)
+    assert broken_of(checked)[1, 4]
+
+
 def test_an_electrode_unchanged_for_16_readings_is_dead() -> None:
     steps = steps_of(40, {})
     steps[:16, 0] = 0

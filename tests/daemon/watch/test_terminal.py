@@ -140,6 +140,8 @@ def test_keys_are_read_above_descriptor_1024(monkeypatch: pytest.MonkeyPatch) ->
                 os.write(near, b"\t\t ")
                 assert not keyboard.wait()
                 assert (keyboard.tabs, keyboard.spaces) == (2, 1)
+                os.write(near, b"\x1bOQ")  # F2
+                assert not keyboard.wait()
                 for typed in (b"q", b"\tq"):
                     os.write(near, typed)
                     assert keyboard.wait()

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from graspd.drivers.base import JointReading, RecordingError
+from graspd.drivers.base import JointReading, LinkCause, RecordingError
 from graspd.drivers.can.frames import ERROR, EXTENDED, LOST, REMOTE, CanFrame
 from graspd.drivers.recordings.can_files import read_asc, read_trc
 from graspd.drivers.recordings.can_log import line_of
@@ -255,6 +255,10 @@ def test_each_opening_of_a_logged_port_is_up_after_its_own_wait(
             end_ns = start_ns + 250 * MS + seq * 10 * MS
             log.feed(end_ns, (LineEvent.RECEIVED, encode(sweep(seq, 2000 + seq * 10_000))))
     assert caplog.text.count("up after 0.2") == caplog.text.count("up after") == 2
+    for t_ns in range(51_000_000 * MS, 51_000_003 * MS, MS):
+        log.stream.lost(LinkCause.SILENT, "no answer", t_ns)
+        log.feed(t_ns, (LineEvent.OPENED, b""))
+    assert caplog.text.count("no answer") == 1
 
 
 @pytest.mark.parametrize("content", [b"", b"no frames\n" * 1000])

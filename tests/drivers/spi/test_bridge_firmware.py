@@ -180,6 +180,7 @@ def test_sound_frames_are_found_among_100000_damaged_and_errors_counted(
     "words",
     [
         "--sensors 2.5",
+        "--sensors 3,",
         "--period-us 20000ms",
         "--dead 0:3,4",
         "--answer 0:3:A52DH",
