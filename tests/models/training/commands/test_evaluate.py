@@ -169,7 +169,7 @@ def test_a_table_of_one_object_beside_published_ones_is_refused(data: Path, tmp_
 
 
 def test_a_full_standard_output_is_not_blamed_on_the_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     def prints() -> int:
         return sys.stdout.write("." * 10_000)
@@ -177,7 +177,7 @@ def test_a_full_standard_output_is_not_blamed_on_the_folder(
     with Path("/dev/full").open("w") as full:
         monkeypatch.setattr(sys, "stdout", full)
         assert guarded(lambda: exit_code("evaluate", tmp_path, prints)) == 1
-    said = capsys.readouterr().err
+    said = capfd.readouterr().err
     assert said == "graspd: cannot write to standard output: No space left on device\n"
 
 
