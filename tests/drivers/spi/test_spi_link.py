@@ -161,13 +161,13 @@ def test_a_link_broken_within_a_frame_comes_back(tmp_path: Path) -> None:
         def is_lost_often() -> bool:
             twin.run_once()
             readings.extend(tactile(driver.read_ready()))
-            return driver.counters.link_losses >= 6
+            return driver.counters.link_losses >= 6 and len(readings) > 150
 
         wait_until(is_lost_often, step_s=0.0002)
         # The twin may break the link again before the driver notices.
-        assert driver.counters.link_losses <= twin.injected["disconnect"] <= 7
+        losses = driver.counters.link_losses
+        assert losses <= twin.injected["disconnect"] <= losses + 1
     made = {row.tobytes() for row in rows[: twin.sweeps_made]}
-    assert len(readings) > 150
     assert all(reading.counts.tobytes() in made for reading in readings)
     seqs = [reading.seq for reading in readings]
     assert seqs == sorted(set(seqs))
