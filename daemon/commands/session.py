@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import os
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,7 +20,6 @@ from graspd.daemon.assembly.plan import Plan, recorded_kind
 from graspd.daemon.commands.arguments import add_reading
 from graspd.daemon.judge.pipeline import Judgement, Pipeline
 from graspd.daemon.judge.reasons import Reason
-from graspd.daemon.process.files import require_linux
 from graspd.daemon.process.text import complain, printable, write_json, write_lines
 from graspd.daemon.run.replaying import trained_on
 from graspd.daemon.run.unjudged import Unjudged
@@ -90,9 +88,7 @@ def run(args: argparse.Namespace) -> int:
     if args.action == "settle":
         _settle(wanted, model, list(dict.fromkeys(args.lifts)), args.told)
     elif args.action == "reset":
-        require_linux("to keep a session")
-        folder = SessionFolder(wanted.session_path)
-        with folder if os.path.isdir(folder.path) else contextlib.nullcontext():  # locking makes it
+        with SessionFolder(wanted.session_path).if_there() as folder:
             result = "forgotten" if folder.remove() else "no session was kept"
         write_lines(f"{printable(str(wanted.session_path))}: {result}")
     else:
@@ -119,9 +115,13 @@ def _show(wanted: scene.Scene, model: TactileModel, *, as_json: bool) -> int:
             {"file": f"{n}{ENDING}", **msgspec.to_builtins(one), "trust": _learned(one.trust)}
             for n, one in sessions.items()
         ]
-        session = documents[0] if documents else None
-        kept = {"session": session, "others": documents[1:]}
-        write_json({"folder": str(path), "calibrated": calibrated, **kept})
+        document = {
+            "folder": str(path),
+            "calibrated": calibrated,
+            "session": documents[0] if documents else None,
+            "others": documents[1:],
+        }
+        write_json(document)
     else:
         write_lines(*_lines(path, sessions, model, calibrated))
     return 2 if len(sessions) < len(found) else 0
@@ -262,8 +262,7 @@ def _settle(wanted: scene.Scene, model: TactileModel, names: list[str], told: st
     sensors is open in the files of both sensors' sessions.
     """
     path, trust = wanted.session_path, assembly.build_pipeline(Plan.of(wanted), model).trust
-    folder = SessionFolder(path)
-    with folder if os.path.isdir(path) else contextlib.nullcontext():  # locking makes it
+    with SessionFolder(path).if_there() as folder:
         found = _readable(look(path))
         mine = {number: kept for number, kept in found.items() if kept.model == model.sha256}
         if trust is None or not mine:

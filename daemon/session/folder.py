@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from operator import attrgetter
 from pathlib import Path
 from typing import Final, Self
@@ -90,6 +90,17 @@ class SessionFolder:
 
     def __exit__(self, *_details: object) -> None:
         self.close()
+
+    @contextmanager
+    def if_there(self) -> Iterator[Self]:
+        """Lock the folder within the block; one that is not there is not made. Raises as `lock`."""
+        require_linux("to keep a session")
+        if os.path.isdir(self.path):
+            self.lock()
+        try:
+            yield self
+        finally:
+            self.close()
 
     def load(self) -> Found:
         """Return the result of `look`; `save` may replace its files. Raises `SessionFileError`."""
